@@ -139,7 +139,7 @@ class Filter:
 def samples(duration: float) -> tuple[sd.ImuRecord, Recording, np.ndarray]:
     """Return a simulated record, the same as a recording, and its rows: rate, specific force, field."""
     record = export_filter.simulated(duration, 1, 0)
-    force, field = (factor * one.vector_b for factor, one in zip((9.81, 45.0), record.vectors, strict=True))
+    force, field = (factor * series.vector_b for factor, series in zip((9.81, 45.0), record.vectors, strict=True))
     rate = record.increments / record.intervals[:, None]
     recording = Recording(
         source="simulated", time=record.time[1:], rate=rate, specific_force=force, magnetic_field=field
@@ -225,9 +225,11 @@ def peers(folder: Path) -> tuple[list[Filter], list[str]]:
     return filters, missing
 
 
-def compiled(one: Filter, folder: Path, prefix: str, flags: tuple[str, ...], driver: str, single: bool) -> list[Path]:
+def compiled(
+    filter_: Filter, folder: Path, prefix: str, flags: tuple[str, ...], driver: str, single: bool
+) -> list[Path]:
     """Compile the sources of a filter and its driver; return the objects, that of the driver first."""
-    sources = one.sources(folder, "single" if single else "double")
+    sources = filter_.sources(folder, "single" if single else "double")
     cpp = any(source.suffix == ".cpp" for source in sources)
     (folder / f"driver.{'cpp' if cpp else 'c'}").write_text(driver, encoding="utf-8")
     objects = []
@@ -235,18 +237,18 @@ def compiled(one: Filter, folder: Path, prefix: str, flags: tuple[str, ...], dri
         objects.append(folder / f"{source.stem}.o")
         language = (f"{prefix}g++", *PLAIN) if source.suffix == ".cpp" else (f"{prefix}gcc", "-std=gnu99")
         precision = ("-DVQF_SINGLE_PRECISION",) if single else ()
-        include = (f"-I{folder}", *one.flags, *precision)
+        include = (f"-I{folder}", *filter_.flags, *precision)
         subprocess.run([*language, *flags, *include, "-c", source, "-o", objects[-1]], check=True, capture_output=True)
     return objects
 
 
-def driver_of(one: Filter, rows: np.ndarray, main: str, *, real: str) -> str:
+def driver_of(filter_: Filter, rows: np.ndarray, main: str, *, real: str) -> str:
     """Return the driver with its samples."""
     numbers = ",\n".join("{" + ", ".join(f"{x:.9g}" for x in row) + "}" for row in rows.tolist())
-    outside = 'extern "C"' if ".hpp" in one.driver else ""
+    outside = 'extern "C"' if ".hpp" in filter_.driver else ""
     return (
         f"typedef {real} real;\nenum {{ ROWS = {len(rows)} }};\n#ifndef COUNT\n#define COUNT ROWS\n#endif\n"
-        f"static const real rows[ROWS][9] = {{{numbers}}};\n{one.driver}{main.replace('EXTERN', outside)}"
+        f"static const real rows[ROWS][9] = {{{numbers}}};\n{filter_.driver}{main.replace('EXTERN', outside)}"
     )
 
 
@@ -258,29 +260,29 @@ def text_bytes(*files: Path) -> int:
     return sum(sum(map(int, line.split()[:2])) for line in shown.splitlines()[1:])
 
 
-def on_a_board(one: Filter, rows: np.ndarray, folder: Path, without: int) -> dict[str, Any]:
+def on_a_board(filter_: Filter, rows: np.ndarray, folder: Path, without: int) -> dict[str, Any]:
     """Return sizes on a Cortex-M4 and, with its emulator, stack and instructions. ``without``: flash of the samples and the driver."""
-    driver = driver_of(one, rows[:SAMPLES], OF_A_BOARD, real="float")
-    found: dict[str, Any] = {}
+    driver = driver_of(filter_, rows[:SAMPLES], OF_A_BOARD, real="float")
+    sizes: dict[str, Any] = {}
     lines = []
     for count in (WARM, SAMPLES):
         flags = (*ARM, f"-DCOUNT={count}")
-        first, *others = compiled(one, folder, "arm-none-eabi-", flags, driver, single=True)
-        tool = "arm-none-eabi-g++" if ".hpp" in one.driver else "arm-none-eabi-gcc"
+        first, *others = compiled(filter_, folder, "arm-none-eabi-", flags, driver, single=True)
+        tool = "arm-none-eabi-g++" if ".hpp" in filter_.driver else "arm-none-eabi-gcc"
         program = folder / f"run{count}"
         subprocess.run(
             [tool, *ARM, *LINK, first, *others, "-o", program, "-lm"], check=True, capture_output=True, cwd=folder
         )
         symbols = subprocess.run(["arm-none-eabi-nm", "-S", first], check=True, capture_output=True, text=True).stdout
         (size,) = (int(line.split()[1], 16) for line in symbols.splitlines() if line.split()[-1] == "state")
-        found |= {"code": text_bytes(*others), "flash": text_bytes(program) - without, "state": size}
+        sizes |= {"code": text_bytes(*others), "flash": text_bytes(program) - without, "state": size}
         if shutil.which("qemu-arm") is not None:
             stack, number = emulated(program)
-            found["stack"] = stack
+            sizes["stack"] = stack
             lines.append(number)
     if len(lines) == 2:
-        found["instructions"] = round((lines[1] - lines[0]) / (SAMPLES - WARM))
-    return found
+        sizes["instructions"] = round((lines[1] - lines[0]) / (SAMPLES - WARM))
+    return sizes
 
 
 def emulated(program: Path) -> tuple[int, int]:
@@ -298,12 +300,12 @@ def emulated(program: Path) -> tuple[int, int]:
     raise SystemExit(f"qemu-arm ended with status {run.returncode}")
 
 
-def on_this_machine(one: Filter, rows: np.ndarray, folder: Path, *, single: bool) -> float:
+def on_this_machine(filter_: Filter, rows: np.ndarray, folder: Path, *, single: bool) -> float:
     """Return the time of a sample, s."""
     flags = ("-O2", "-ffp-contract=off")
-    driver = driver_of(one, rows, OF_THIS_MACHINE, real="float" if single else "double")
-    objects = compiled(one, folder, "", flags, driver, single)
-    tool = "g++" if ".hpp" in one.driver else "gcc"
+    driver = driver_of(filter_, rows, OF_THIS_MACHINE, real="float" if single else "double")
+    objects = compiled(filter_, folder, "", flags, driver, single)
+    tool = "g++" if ".hpp" in filter_.driver else "gcc"
     subprocess.run([tool, *objects, "-o", folder / "run", "-lm"], check=True, capture_output=True)
     return float(subprocess.run([folder / "run"], check=True, capture_output=True, text=True).stdout)
 
@@ -338,20 +340,20 @@ def main(*, duration: float = 100.0, repeats: int = 5, sources: Path | None = No
             )
             (Path(scratch) / "nothing").mkdir()
             without = on_a_board(nothing, rows, Path(scratch) / "nothing", 0)["flash"]
-        found = []
-        for k, one in enumerate((*our_filters(record, recording), *others)):
-            columns: dict[str, Any] = {"name": one.name}
+        described = []
+        for k, filter_ in enumerate((*our_filters(record, recording), *others)):
+            columns: dict[str, Any] = {"name": filter_.name}
             for part in ("arm", "double", "single"):
                 folder = Path(scratch) / f"{k}-{part}"
                 folder.mkdir()
                 if part == "arm" and board:
-                    columns |= on_a_board(one, rows, folder, without)
-                elif part != "arm" and host and (part, one.driver) != ("double", FUSION):
-                    columns[f"{part}_ns"] = 1e9 * on_this_machine(one, rows, folder, single=part == "single")
-            if one.kernel is not None:
-                columns["package_ns"] = 1e9 * seconds(one.kernel, repeats) / len(rows)
-            found.append(columns)
-    return {"machine": describe(), "missing": missing, "filters": found}
+                    columns |= on_a_board(filter_, rows, folder, without)
+                elif part != "arm" and host and (part, filter_.driver) != ("double", FUSION):
+                    columns[f"{part}_ns"] = 1e9 * on_this_machine(filter_, rows, folder, single=part == "single")
+            if filter_.kernel is not None:
+                columns["package_ns"] = 1e9 * seconds(filter_.kernel, repeats) / len(rows)
+            described.append(columns)
+    return {"machine": describe(), "missing": missing, "filters": described}
 
 
 COLUMNS = ("code", "flash", "state", "stack", "instructions", "double_ns", "single_ns", "package_ns")

@@ -82,7 +82,7 @@ def at_edges(record: ImuRecord) -> ImuRecord:
 def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Callable[[], Any], int]]:
     """Return the filters with error states: on the record, also with measurements at every 50th sample, and for recordings."""
     n, few = len(record.increments), len(recording.time)
-    rare = replace(record, vectors=tuple(one.taken(slice(49, None, 50)) for one in record.vectors))
+    rare = replace(record, vectors=tuple(series.taken(slice(49, None, 50)) for series in record.vectors))
     return {
         "strapdown estimation.run, two vectors, 15 error states": (
             lambda: estimation.run(record, NOISE, START, STATES),
@@ -103,13 +103,13 @@ def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Call
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Callable[[], Any], int]]:
     """Return the call of each installed peer on the record, and its number of samples (fewer for slow ones)."""
-    found: dict[str, tuple[Callable[[], Any], int]] = {}
+    calls: dict[str, tuple[Callable[[], Any], int]] = {}
     n = len(rate)
     try:
         from vqf import VQF
 
-        found["vqf VQF.updateBatch 6D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force), n)
-        found["vqf VQF.updateBatch 9D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force, field), n)
+        calls["vqf VQF.updateBatch 6D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force), n)
+        calls["vqf VQF.updateBatch 9D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force, field), n)
     except ImportError:
         pass
     try:
@@ -124,17 +124,17 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
             for k in range(few):
                 ahrs.update_no_magnetometer(degrees[k], force[k])
 
-        found["imufusion update_no_magnetometer (C, a call a sample)"] = (fusion, few)
+        calls["imufusion update_no_magnetometer (C, a call a sample)"] = (fusion, few)
     except ImportError:
         pass
     try:
         from ahrs.filters import EKF
 
         few_ekf = 2_000
-        found["ahrs EKF"] = (lambda: EKF(gyr=rate[:few_ekf], acc=force[:few_ekf], frequency=RATE), few_ekf)
+        calls["ahrs EKF"] = (lambda: EKF(gyr=rate[:few_ekf], acc=force[:few_ekf], frequency=RATE), few_ekf)
     except ImportError:
         pass
-    return found
+    return calls
 
 
 def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
@@ -164,14 +164,14 @@ def import_times(repeats: int = 7) -> tuple[float, float]:
 
 def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
     """Return ns per sample (median and minimum) of each, the ratios to ours, and the import times."""
-    one, rate, force, field = samples(n, 1)
+    one_vector, rate, force, field = samples(n, 1)
     two, *_ = samples(n, 2)
     between = asynchronous(two)
     edges = at_edges(between)
     gate, robust = Gate(recovery=None), Robust()
     few = n // 10
     works = {
-        "strapdown estimation.run, one vector": (lambda: estimation.run(one, NOISE, START), n),
+        "strapdown estimation.run, one vector": (lambda: estimation.run(one_vector, NOISE, START), n),
         "strapdown estimation.run, two vectors": (lambda: estimation.run(two, NOISE, START), n),
         "strapdown estimation.run, two vectors, asynchronous": (lambda: estimation.run(between, NOISE, START), n),
         "strapdown estimation.run, the same with gyro samples at their times": (
@@ -194,7 +194,7 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
             ),
         ),
         **peers(rate, force, field),
-        "strapdown StepFilter on filterpy": (step_by_step(one, 1000), 1000),
+        "strapdown StepFilter on filterpy": (step_by_step(one_vector, 1000), 1000),
     }
     for work, _ in works.values():
         work()

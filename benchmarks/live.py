@@ -93,30 +93,30 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Call, int]]:
     """Return a call of each installed peer with a sample, and its number of samples."""
-    found: dict[str, tuple[Call, int]] = {}
+    calls: dict[str, tuple[Call, int]] = {}
     n, few = len(rate), 2000
     try:
         import imufusion
 
         fusion, degrees = imufusion.Ahrs(), np.degrees(rate)
         fusion.set_sample_period(1.0 / RATE)
-        found["imufusion update (C)"] = (lambda k: fusion.update(degrees[k], force[k], field[k]), n)
+        calls["imufusion update (C)"] = (lambda k: fusion.update(degrees[k], force[k], field[k]), n)
     except ImportError:
         pass
     try:
         from vqf import VQF, PyVQF
 
         vqf, six, plain = VQF(1.0 / RATE), VQF(1.0 / RATE), PyVQF(1.0 / RATE)
-        found["vqf VQF.update 9D (C++)"] = (lambda k: vqf.update(rate[k], force[k], field[k]), n)
-        found["vqf VQF.update 6D (C++)"] = (lambda k: six.update(rate[k], force[k]), n)
-        found["vqf PyVQF.update 9D (Python)"] = (lambda k: plain.update(rate[k], force[k], field[k]), few)
+        calls["vqf VQF.update 9D (C++)"] = (lambda k: vqf.update(rate[k], force[k], field[k]), n)
+        calls["vqf VQF.update 6D (C++)"] = (lambda k: six.update(rate[k], force[k]), n)
+        calls["vqf PyVQF.update 9D (Python)"] = (lambda k: plain.update(rate[k], force[k], field[k]), few)
     except ImportError:
         pass
     try:
         import smsfusion
 
         sms = smsfusion.AHRS(RATE)
-        found["smsfusion AHRS.update, heading (numba)"] = (
+        calls["smsfusion AHRS.update, heading (numba)"] = (
             lambda k: sms.update(force[k], rate[k], head=0.0, head_var=0.01, head_degrees=False),
             few,
         )
@@ -126,13 +126,13 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
         import attipy
 
         atti = attipy.AHRS(RATE, nav_frame="ENU")
-        found["AttiPy AHRS.update, yaw (numba)"] = (
+        calls["AttiPy AHRS.update, yaw (numba)"] = (
             lambda k: atti.update(force[k], rate[k], yaw=0.0, yaw_var=0.01),
             few,
         )
     except ImportError:
         pass
-    return found
+    return calls
 
 
 def main(*, n: int = 20_000, repeats: int = 5) -> dict[str, Any]:

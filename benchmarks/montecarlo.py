@@ -119,31 +119,31 @@ def filterpy_ns(repeats: int, few: int = 200) -> float:
     return least(work, max(repeats // 4, 2)) / few * 1e9
 
 
-def threads_ratio(one: Plan, runs: int) -> float:
+def threads_ratio(campaign: Plan, runs: int) -> float:
     """Return the ratio of the wall time of two chunks in sequence to that in two threads."""
     start = time.perf_counter()
     for first in (0, runs):
-        lanes.run_chunk(one, first, runs)
+        lanes.run_chunk(campaign, first, runs)
     alone = time.perf_counter() - start
     with ThreadPoolExecutor(2) as pool:
         start = time.perf_counter()
-        list(pool.map(lambda first: lanes.run_chunk(one, first, runs), (0, runs)))
+        list(pool.map(lambda first: lanes.run_chunk(campaign, first, runs), (0, runs)))
         return alone / (time.perf_counter() - start)
 
 
 def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str, Any]:
     """Return all figures, in ns per run-step unless named otherwise."""
-    one = plan(steps)
+    base = plan(steps)
     # The first runs are kept as examples; later ones represent a campaign.
-    full = least(lambda: lanes.run_chunk(one, 1000, runs), repeats) / runs / steps * 1e9
+    full = least(lambda: lanes.run_chunk(base, 1000, runs), repeats) / runs / steps * 1e9
     few = plan(2000)
     peers = {
         "scalar machine": least(lambda: scalar.run_chunk(few, 100, 4), 3) / 4 / 2000 * 1e9,
         **{
-            f"{name}, {count} error states, {words}": least(lambda p=one, m=run_chunk: m(p, 100, 8), 3)  # type: ignore[misc]
-            / (8 * one.samples)
+            f"{name}, {count} error states, {words}": least(lambda p=campaign, m=run_chunk: m(p, 100, 8), 3)  # type: ignore[misc]
+            / (8 * campaign.samples)
             * 1e9
-            for count, words, one in (
+            for count, words, campaign in (
                 (12, "tracker at 2 Hz", with_states(600.0)),
                 (9, "two vectors", two_vectors(60.0)),
             )
@@ -158,7 +158,7 @@ def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str,
         "runs": runs,
         "full": full,
         "peers": peers,
-        "two_threads": threads_ratio(one, runs),
+        "two_threads": threads_ratio(base, runs),
         "ten_thousand_squared_s": full * 1e-9 * 1e8 / 2,
     }
 

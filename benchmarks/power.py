@@ -109,10 +109,10 @@ def single_run_p_values(filters: Filters, *, averages: bool = True) -> dict[str,
     white = consistency.whitened(filters.error, np.broadcast_to(filters.covariance, (*filters.error.shape, 2)))
     runs, steps, _ = filters.innovation.shape
     clock = np.arange(steps, dtype=np.float64)
-    found: dict[str, list[float]] = {}
+    p_values: dict[str, list[float]] = {}
 
     def note(name: str, p: float) -> None:
-        found.setdefault(name, []).append(p)
+        p_values.setdefault(name, []).append(p)
 
     for k in range(runs):
         z = filters.innovation[k]
@@ -125,7 +125,7 @@ def single_run_p_values(filters: Filters, *, averages: bool = True) -> dict[str,
         note("normality", whiteness.anderson_darling(z)[1])
         note("mean innovation", whiteness.mean_innovation_p_value(z)[1])
         note("cross-correlation", whiteness.cross_correlation_p_value(clock, z[:, 0], clock, z[:, 1])[2])
-    return {name: np.array(values) for name, values in found.items()}
+    return {name: np.array(values) for name, values in p_values.items()}
 
 
 def many_run_p_values(white: Array) -> dict[str, Array]:

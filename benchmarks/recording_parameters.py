@@ -88,14 +88,16 @@ class Group:
 
 def groups(folders: Sequence[Path], *, smooth: bool, every: int = 1) -> list[Group]:
     """Return the sets, and after them those with a magnetometer without it, their names with a minus sign."""
-    found = [(folder.name, leaderboard.read(folder)[::every]) for folder in folders]
-    for name, those in found[:]:
+    sets = [(folder.name, leaderboard.read(folder)[::every]) for folder in folders]
+    for name, those in sets[:]:
         if those[0].magnetic_field is not None:
-            found.append((f"{name} −", [replace(one, magnetic_field=None, magnetic_unit="") for one in those]))
+            sets.append(
+                (f"{name} −", [replace(recording, magnetic_field=None, magnetic_unit="") for recording in those])
+            )
     peer = functools.partial(leaderboard.vqf, offline=smooth)
     return [
-        Group(name, those, np.array([leaderboard.score(one, peer).error_deg for one in those])[:, 0])
-        for name, those in found
+        Group(name, those, np.array([leaderboard.score(recording, peer).error_deg for recording in those])[:, 0])
+        for name, those in sets
     ]
 
 
@@ -103,19 +105,23 @@ def scored(group: Group, parameters: AhrsParameters, *, smooth: bool) -> dict[st
     """Return the error of the total relative to the peer's, the coverage of the total and the median NEES."""
 
     def run(recording: Recording) -> tuple[Array, Array]:
-        found = ahrs.estimate(recording, parameters, smooth=smooth, full_covariance=True).estimate
-        assert found.covariance is not None
-        return found.attitude, found.covariance[:, :3, :3]
+        estimate = ahrs.estimate(recording, parameters, smooth=smooth, full_covariance=True).estimate
+        assert estimate.covariance is not None
+        return estimate.attitude, estimate.covariance[:, :3, :3]
 
-    found = leaderboard.mean([leaderboard.score(one, run) for one in group.recordings])
-    assert found.error_deg is not None
-    assert found.coverage is not None
-    return {"ratio": found.error_deg[0] / float(group.peer.mean()), "coverage": found.coverage[0], "nees": found.nees}
+    result = leaderboard.mean([leaderboard.score(recording, run) for recording in group.recordings])
+    assert result.error_deg is not None
+    assert result.coverage is not None
+    return {
+        "ratio": result.error_deg[0] / float(group.peer.mean()),
+        "coverage": result.coverage[0],
+        "nees": result.nees,
+    }
 
 
 def geometric_mean(scores: Sequence[dict[str, float]]) -> float:
     """Return the geometric mean of the ratios."""
-    return float(np.exp(np.mean(np.log([one["ratio"] for one in scores]))))
+    return float(np.exp(np.mean(np.log([score["ratio"] for score in scores]))))
 
 
 def left_out(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
@@ -132,11 +138,16 @@ def left_out(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
         for name, parameters in candidates.items():
             scores[name] = [scored(group, parameters, smooth=smooth) for group in model]
             print(
-                "smoothed" if smooth else "online", name, [round(one["ratio"], 3) for one in scores[name]], flush=True
+                "smoothed" if smooth else "online",
+                name,
+                [round(score["ratio"], 3) for score in scores[name]],
+                flush=True,
             )
         for k, group in enumerate(model):
             others = {name: those[:k] + those[k + 1 :] for name, those in scores.items()}
-            enough = [n for n, s in others.items() if min(one["coverage"] for one in s) >= MIN_COVERAGE] or ["released"]
+            enough = [n for n, s in others.items() if min(score["coverage"] for score in s) >= MIN_COVERAGE] or [
+                "released"
+            ]
             best = min(enough, key=lambda name: geometric_mean(others[name]))
             if not group.name.endswith("−"):
                 result[group.name] = {"chosen": best, **scores[best][k], "released": scores["released"][k]["ratio"]}
@@ -156,7 +167,7 @@ def parts(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
                 **(part[1] if isinstance(part, tuple) else {}),
             ):
                 scores.append(scored(group, parameters if isinstance(part, tuple) else part(parameters), smooth=smooth))
-        held = float(np.mean([one["coverage"] for one in scores]))
+        held = float(np.mean([score["coverage"] for score in scores]))
         result[name] = {"ratio": geometric_mean(scores), "coverage": held}
         print("smoothed" if smooth else "online", "without", name, result[name], flush=True)
     return result
@@ -168,8 +179,8 @@ def table(result: dict[str, Any]) -> str:
     for name in result["parts"]["online"]:
         cells = [name]
         for mode in ("online", "smoothed"):
-            one = result["parts"][mode][name]
-            cells += [f"{one['ratio']:.3f}", f"{one['coverage']:.2f}"]
+            score = result["parts"][mode][name]
+            cells += [f"{score['ratio']:.3f}", f"{score['coverage']:.2f}"]
         rows.append(cells)
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 

@@ -44,9 +44,9 @@ def ours(recording: Recording, *, smooth: bool = False) -> tuple[Array, Array]:
     """Return the estimate of this package at the stamps of the recording."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = (sd.smooth if smooth else sd.estimate)(recording, full_covariance=True)
-    assert found.covariance is not None
-    return found.attitude, found.covariance[:, :3, :3]
+        estimate = (sd.smooth if smooth else sd.estimate)(recording, full_covariance=True)
+    assert estimate.covariance is not None
+    return estimate.attitude, estimate.covariance[:, :3, :3]
 
 
 def samples(recording: Recording) -> tuple[float, list[Array]]:
@@ -170,26 +170,28 @@ def lengths(vectors: Array) -> Array:
 
 def read(folder: Path) -> list[Recording]:
     """Return the recordings of a folder."""
-    found = [
+    files = [
         sd.read(path) for path in sorted(folder.iterdir()) if path.suffix in (".hdf5", ".h5", ".csv", ".bag", ".mcap")
     ]
-    return [one for one in found if isinstance(one, Recording) and one.true_attitude is not None]
+    return [
+        recording for recording in files if isinstance(recording, Recording) and recording.true_attitude is not None
+    ]
 
 
 def mean(scores: Sequence[Score]) -> Score:
     """Return the score of a set."""
-    judged = [one for one in scores if one.error_deg is not None]
-    with_region = [one for one in judged if one.coverage is not None]
+    judged = [score for score in scores if score.error_deg is not None]
+    with_region = [score for score in judged if score.coverage is not None]
 
     def over(name: str, those: Sequence[Score]) -> tuple[float, float, float] | None:
-        return tuple(np.mean([getattr(one, name) for one in those], axis=0).tolist()) if those else None
+        return tuple(np.mean([getattr(score, name) for score in those], axis=0).tolist()) if those else None
 
     return Score(
         over("error_deg", judged),
         over("coverage", with_region),
-        float(np.median([one.nees for one in with_region])) if with_region else None,
-        min(one.rows for one in scores),
-        float(np.mean([one.us for one in scores])),
+        float(np.median([score.nees for score in with_region])) if with_region else None,
+        min(score.rows for score in scores),
+        float(np.mean([score.us for score in scores])),
     )
 
 
@@ -198,7 +200,12 @@ def compared(folders: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[st
     for folder in folders:
         recordings = read(folder)
         for name in names:
-            yield folder.name, name, len(recordings), mean([score(one, FILTERS[name][1]) for one in recordings])
+            yield (
+                folder.name,
+                name,
+                len(recordings),
+                mean([score(recording, FILTERS[name][1]) for recording in recordings]),
+            )
 
 
 def least_times(recording: Recording, names: Sequence[str], rounds: int = 7) -> dict[str, float]:
@@ -247,14 +254,14 @@ def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | 
     """Return the scores of filters on sets, added to those known, and print each as soon as it is known."""
     result: dict[str, Any] = {"metric": " ".join(__doc__.split("\n\n")[1].split()), "sets": {}, "filters": {}}
     result.update({key: dict(value) for key, value in (known or {}).items() if key in ("sets", "filters")})
-    for where, name, number, found in compared(folders, names):
+    for where, name, number, score in compared(folders, names):
         result["sets"][where] = number
-        result["filters"].setdefault(name, {})[where] = asdict(found)
+        result["filters"].setdefault(name, {})[where] = asdict(score)
         words = [f"{where} ({number})".ljust(14), name.ljust(18)]
-        for values in (found.error_deg, found.coverage):
+        for values in (score.error_deg, score.coverage):
             words.append(("" if values is None else "/".join(f"{x:.2f}" for x in values)).rjust(18))
-        words.append("    " if found.nees is None else f"{found.nees:4.2f}")
-        print(*words, f"{found.rows:.3f} {found.us:6.2f}", flush=True)
+        words.append("    " if score.nees is None else f"{score.nees:4.2f}")
+        print(*words, f"{score.rows:.3f} {score.us:6.2f}", flush=True)
     return result
 
 

@@ -88,10 +88,10 @@ def measure(samples: int, seconds: float) -> dict:
         absent.append("vqf")
     result: dict = {"machine": describe(), "samples": samples, "cases": {}, "absent": absent}
     for name, spacing in SPACING.items():
-        one = record(*data, spacing)
+        spaced = record(*data, spacing)
         functions: dict[str, Callable[[], object]] = {
-            "filter": lambda one=one: estimation.run(one, noise, initial),
-            "smoother": lambda one=one: estimation.smooth(one, noise, initial),
+            "filter": lambda spaced=spaced: estimation.run(spaced, noise, initial),
+            "smoother": lambda spaced=spaced: estimation.smooth(spaced, noise, initial),
         }
         if not absent:  # it uses the vectors of every sample in any case
             gyr, acc, mag = (np.ascontiguousarray(x) for x in (data[0], 9.81 * data[1], 50.0 * data[2]))

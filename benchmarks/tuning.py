@@ -55,10 +55,10 @@ def seconds(work: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> float:
+def step_seconds(case: tuning.Case, filter_setup: setup.FilterSetup, samples: int) -> float:
     """Return the processor time per gyro sample of the filterpy interface, including measurements, s."""
-    modelled = setup.modelled_record(one.record, chosen)
-    filter_ = StepFilter(chosen.process_noise, one.initial)
+    modelled = setup.modelled_record(case.record, filter_setup)
+    filter_ = StepFilter(filter_setup.process_noise, case.initial)
     first, second = modelled.vectors
     dt = float(modelled.time[1] - modelled.time[0])
     every = round(1.0 / dt)
@@ -76,14 +76,14 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
     """Return times of a pass, and of each optimiser with the difference of its end from the best."""
     scenario, data = record(duration, rate)
     right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3, states=False)
-    one = tuning.record_case(data, right, seed=1)
+    case = tuning.record_case(data, right, seed=1)
     values = tuning.values_of(right, FREE, [data])
     off = tuning.with_values(right, {name: wrong * value for name, value in values.items()})
-    objective = tuning.likelihood([one], off, FREE)
+    objective = tuning.likelihood([case], off, FREE)
     samples = len(data.increments)
 
     def filter_run() -> None:
-        setup.run(data, right, one.initial, every=samples)
+        setup.run(data, right, case.initial, every=samples)
 
     passes = {
         "one ordinary filter run": seconds(filter_run, repeats),
@@ -93,7 +93,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
         ),
     }
     few = min(samples, 3000)
-    passes["one run of the filterpy face"] = step_seconds(one, right, few) * samples
+    passes["one run of the filterpy face"] = step_seconds(case, right, few) * samples
 
     best = tuning.fit(objective, starts=4, intervals=False)
     rows = []
@@ -112,28 +112,28 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
         )
 
     def ours() -> tuple[np.ndarray, int]:
-        found = tuning.search(objective, objective.start)
-        return found.point, found.steps + 1
+        optimum = tuning.search(objective, objective.start)
+        return optimum.point, optimum.steps + 1
 
     def gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
-        found = objective.derivatives(x)
-        return float(found.value.sum()), found.score.sum(axis=0)
+        derivatives = objective.derivatives(x)
+        return float(derivatives.value.sum()), derivatives.score.sum(axis=0)
 
     def by_runs(x: np.ndarray) -> float:
         return float(objective.minus_log(x)[0])
 
     def quasi_newton() -> tuple[np.ndarray, int]:
-        found = minimize(gradient, objective.start, jac=True, method="BFGS", options={"gtol": 1e-2})
-        return found.x, found.nfev
+        optimum = minimize(gradient, objective.start, jac=True, method="BFGS", options={"gtol": 1e-2})
+        return optimum.x, optimum.nfev
 
     def differences() -> tuple[np.ndarray, int]:
-        found = minimize(by_runs, objective.start, jac="3-point", method="BFGS", options={"gtol": 1e-2})
-        return found.x, found.nfev
+        optimum = minimize(by_runs, objective.start, jac="3-point", method="BFGS", options={"gtol": 1e-2})
+        return optimum.x, optimum.nfev
 
     def free_of_derivatives(method: str, tolerance: dict[str, float]) -> Callable[[], tuple[np.ndarray, int]]:
         def work() -> tuple[np.ndarray, int]:
-            found = minimize(by_runs, objective.start, method=method, options={"maxiter": 2000, **tolerance})
-            return found.x, found.nfev
+            optimum = minimize(by_runs, objective.start, method=method, options={"maxiter": 2000, **tolerance})
+            return optimum.x, optimum.nfev
 
         return work
 
@@ -145,7 +145,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
     report("COBYLA (linear models in a trust region)", free_of_derivatives("COBYLA", {"tol": 1e-3, "rhobeg": 1.0}))
 
     start = time.perf_counter()
-    whole = tuning.fit(tuning.likelihood([one], off, FREE), starts=20, threads=2)
+    whole = tuning.fit(tuning.likelihood([case], off, FREE), starts=20, threads=2)
     wall = time.perf_counter() - start
     simplex = next(row for row in rows if row["optimiser"] == "Nelder-Mead")
     mine = next(row for row in rows if "ours" in str(row["optimiser"]))

@@ -91,7 +91,7 @@ class AllanDeviation(Listed):
         rows = [
             (
                 self.taus[i],
-                *(one[i] for one in self.deviation),
+                *(axis[i] for axis in self.deviation),
                 float(np.min(self.edf[:, i])),
             )
             for i in places
@@ -152,7 +152,7 @@ def allan_deviation(
     counts = None if known.all() else np.concatenate([[0], np.cumsum(known)])
     multiples = _multiples(taus, len(record), dt, gaps=counts is not None)
     axes = [_of_axis(record[:, axis], multiples, counts) for axis in range(record.shape[1])]
-    deviation, edf, alphas = (np.array(one) for one in zip(*axes, strict=True))
+    deviation, edf, alphas = (np.array(part) for part in zip(*axes, strict=True))
     deviation *= scale
     from scipy.stats import chi2
 

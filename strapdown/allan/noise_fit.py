@@ -164,8 +164,13 @@ class NoiseFit(Listed):
         """Return the coefficients with their intervals, as a table."""
         rows = []
         for row in table(self):
-            term, seen = str(row["term"]).replace("_", " "), row["supported"]
-            values = (row["estimate"] if seen else None, row["lower"] if seen else None, row["upper"], seen)
+            term, supported = str(row["term"]).replace("_", " "), row["supported"]
+            values = (
+                row["estimate"] if supported else None,
+                row["lower"] if supported else None,
+                row["upper"],
+                supported,
+            )
             rows.append(
                 ("xyz"[row["axis"]], f"{row['term']} ({row['symbol']})", term, row["symbol"], row["unit"], *values)
             )
@@ -256,25 +261,25 @@ def fit_noise(
     record, dt, scale = averaged(values, sample_interval, kind)
     level = confidence(level)
     checks.one_of("sensor", sensor, SENSORS)
-    given = [checks.one_of("terms: term", term, TERMS) for term in terms]
-    chosen = tuple(term for term in TERMS if term in given)
-    random_terms = tuple(term for term in chosen if term != "rate_ramp")
+    names = [checks.one_of("terms: term", term, TERMS) for term in terms]
+    in_order = tuple(term for term in TERMS if term in names)
+    random_terms = tuple(term for term in in_order if term != "rate_ramp")
     if not random_terms:
         raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
     segments = _segments(record, dt, random_terms, highest_frequency)
     fits, misfits = [], []
     for axis in range(record.shape[1]):
-        coefficients = [cosine_transform(record[one.place, axis], scale) for one in segments]
+        coefficients = [cosine_transform(record[segment.place, axis], scale) for segment in segments]
         each, whole = binned(coefficients, segments, dt)
         largest = scale * float(max(np.nanmax(record[:, axis]), -np.nanmin(record[:, axis])))
         if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
             raise InputError(
                 f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
             )
-        fits.append(fit_axis(whole, "rate_ramp" in chosen))
+        fits.append(fit_axis(whole, "rate_ramp" in in_order))
         misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
-    samples = sum(one.place.stop - one.place.start for one in segments)
-    fit = _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    samples = sum(segment.place.stop - segment.place.start for segment in segments)
+    fit = _of_axes(in_order, fits, misfits, level=level, samples=samples, sample_interval=dt)
     return replace(fit, sensor=sensor)
 
 
@@ -322,15 +327,15 @@ def expected_errors(parameters: Mapping[str, float], samples: int, sample_interv
     none = np.zeros_like(number)
     inverse = _inverse(_information(Bins(number, none, none, none, basis, 0.0), variance))
     errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    found = {
+    expected = {
         term: float(0.5 * error / math.sqrt(value))  # d√θ/dθ
         for term, error, value in zip(random_terms, errors, theta, strict=True)
         if value > 0.0
     }
     if parameters.get("rate_ramp", 0.0) != 0.0:
         ramp = [float(np.sum((dt * ramp_coefficients(samples, np.arange(s.start, s.stop))) ** 2)) for s in slices]
-        found["rate_ramp"] = 1.0 / math.sqrt(float(np.sum(np.array(ramp) / variance)))
-    return found
+        expected["rate_ramp"] = 1.0 / math.sqrt(float(np.sum(np.array(ramp) / variance)))
+    return expected
 
 
 def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, Array]]:
@@ -462,23 +467,23 @@ def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
     """Return the maximum-likelihood coefficients of each combination of terms on one axis."""
     slope, guess = None if with_ramp else -bins.first_slope, _first_guess(bins)
     combinations = {
-        chosen: _maximise(bins, np.where(chosen, guess, 0.0), np.array(chosen), slope=slope)
-        for chosen in itertools.product((False, True), repeat=len(guess))
-        if any(chosen)
+        subset: _maximise(bins, np.where(subset, guess, 0.0), np.array(subset), slope=slope)
+        for subset in itertools.product((False, True), repeat=len(guess))
+        if any(subset)
     }
-    return AxisFit(bins, slope, combinations, min(combinations.values(), key=lambda one: one.loss))
+    return AxisFit(bins, slope, combinations, min(combinations.values(), key=lambda optimum: optimum.loss))
 
 
 def _weights(fits: Sequence[AxisFit], i: int) -> dict[tuple[bool, ...], float]:
     """Return the weights of the combinations with term i; their sum is 1."""
     cost = {
-        chosen: sum(fit.combinations[chosen].loss + TERM_COST * sum(chosen) for fit in fits)
-        for chosen in fits[0].combinations
-        if chosen[i]
+        subset: sum(fit.combinations[subset].loss + TERM_COST * sum(subset) for fit in fits)
+        for subset in fits[0].combinations
+        if subset[i]
     }
     least = min(cost.values())
     total = sum(math.exp(least - value) for value in cost.values())
-    return {chosen: math.exp(least - value) / total for chosen, value in cost.items()}
+    return {subset: math.exp(least - value) / total for subset, value in cost.items()}
 
 
 def _interval(
@@ -489,7 +494,7 @@ def _interval(
     from scipy.special import ndtr, ndtri
 
     tail = 0.5 - 0.5 * level
-    heavy = {chosen: weight for chosen, weight in weights.items() if weight > min(0.05 * tail, SUPPORT_PROBABILITY)}
+    heavy = {subset: weight for subset, weight in weights.items() if weight > min(0.05 * tail, SUPPORT_PROBABILITY)}
     total = sum(heavy.values())
 
     @functools.cache
@@ -502,7 +507,7 @@ def _interval(
         score = lambda size: ndtri(min(max(below(size), 1e-15), 1.0 - 1e-15)) - ndtri(probability)  # noqa: E731
         return float(brentq(score, low, high, xtol=1e-5 * high))
 
-    sizes = {chosen: math.sqrt(fit.combinations[chosen].theta[i]) for chosen in heavy}
+    sizes = {subset: math.sqrt(fit.combinations[subset].theta[i]) for subset in heavy}
     top, zero = max(sizes.values()), below(0.0)
     high = top if top > 0.0 else math.sqrt(_first_guess(fit.bins)[i])
     while below(high) < 1.0 - tail:
@@ -510,14 +515,14 @@ def _interval(
     upper = crossing(1.0 - tail, top if below(top) < 1.0 - tail else 0.0, high)
     if zero >= SUPPORT_PROBABILITY:
         return math.nan, 0.0, upper
-    estimate = sum(heavy[chosen] / total * size for chosen, size in sizes.items())
+    estimate = sum(heavy[subset] / total * size for subset, size in sizes.items())
     return estimate, crossing(tail, 0.0, top) if zero < tail else 0.0, upper
 
 
-def _signed_root(fit: AxisFit, chosen: NDArray[np.bool_], i: int, value: float) -> float:
+def _signed_root(fit: AxisFit, subset: NDArray[np.bool_], i: int, value: float) -> float:
     """Return the signed root of twice the decrease of the log-likelihood of a combination of terms from its maximum to θ_i = ``value``."""
-    best = fit.combinations[tuple(chosen.tolist())]
-    start, free = best.theta.copy(), chosen.copy()
+    best = fit.combinations[tuple(subset.tolist())]
+    start, free = best.theta.copy(), subset.copy()
     start[i], free[i] = value, False
     if not np.any(start > 0.0):
         start = np.where(free, _first_guess(fit.bins), start)
@@ -616,18 +621,18 @@ def _worst_misfit(
     dt: float,
 ) -> tuple[float, str]:
     """Return the minimum probability of :func:`_misfit_of` over the segments, times their number, and its description."""
-    found = []
-    for coefficient, bins, one in zip(coefficients, each, segments, strict=True):
+    misfits = []
+    for coefficient, bins, part in zip(coefficients, each, segments, strict=True):
         own = best._replace(variance=best.theta @ bins.basis)
-        probability, what = _misfit_of(coefficient, bins, own, random_terms, one, dt)
-        where = "" if len(segments) == 1 else f"in the segment from {one.place.start * dt:.6g} s "
-        found.append((probability, where + what))
-    probability, what = min(found, key=lambda one: one[0])
-    return min(1.0, len(found) * probability), what
+        probability, what = _misfit_of(coefficient, bins, own, random_terms, part, dt)
+        where = "" if len(segments) == 1 else f"in the segment from {part.place.start * dt:.6g} s "
+        misfits.append((probability, where + what))
+    probability, what = min(misfits, key=lambda misfit: misfit[0])
+    return min(1.0, len(misfits) * probability), what
 
 
 def _misfit_of(
-    coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], one: Segment, dt: float
+    coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], segment: Segment, dt: float
 ) -> tuple[float, str]:
     """Return the p-value of the deviation from the fit, and its description; overwrites ``coefficient``.
 
@@ -635,8 +640,8 @@ def _misfit_of(
     step of the bias, whose spectrum may resemble that of a random walk, is an outlier in this series. The smallest p-value of three tests
     is multiplied by three.
     """
-    samples, last = len(coefficient), one.last
-    for s in bin_slices(one.starts, last):
+    samples, last = len(coefficient), segment.last
+    for s in bin_slices(segment.starts, last):
         j = np.arange(s.start, s.stop)
         variance = np.zeros(len(j))
         for term, theta in zip(random_terms, best.theta, strict=True):
@@ -658,7 +663,7 @@ def _misfit_of(
     number = np.diff(edges)
     freedom = number * (last / samples)
     loudest = int(np.argmax(energy / number))
-    found = (
+    tests = (
         (samples * math.erfc(size / math.sqrt(2.0)), f"a sample at {dt * largest:.6g} s is an outlier of {size:.3g} σ"),
         (
             _probability(freedom, energy / number, stretches - 1),
@@ -666,8 +671,8 @@ def _misfit_of(
         ),
         (_spectrum_probability(bins, best), "its spectrum has another shape"),
     )
-    probability, what = min(found, key=lambda test: test[0])  # if several are 0, the first, which has a time
-    return min(1.0, len(found) * probability), what
+    probability, what = min(tests, key=lambda test: test[0])  # if several are 0, the first, which has a time
+    return min(1.0, len(tests) * probability), what
 
 
 def _spectrum_probability(bins: Bins, best: Optimum) -> float:

@@ -102,9 +102,11 @@ def to_specification(fit: NoiseFit, source: str) -> str:
     for term, bound in noise_fit.upper_bounds(fit).items():
         name_of, factor = key(sensor, term)
         values = [bound] if isinstance(bound, float) else list(bound)
-        seen = fit.supported[:, fit.terms.index(term)]
-        if seen.any():
-            below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
+        supported = fit.supported[:, fit.terms.index(term)]
+        if supported.any():
+            below = ", ".join(
+                f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not supported[k]
+            )
             partly.append(f"{name_of}: 0 where not detected, {below}.")
         else:
             shown = ", ".join(f"{value / factor:.4g}" for value in values)
@@ -137,9 +139,9 @@ def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
     if term not in fit.terms:
         raise InputError(f"the fit has no {term}; add it to the terms of the fit")
     i = fit.terms.index(term)
-    seen = fit.supported[:, i]
-    if seen.any():
-        return float(fit.estimate[seen, i].max()), True
+    supported = fit.supported[:, i]
+    if supported.any():
+        return float(fit.estimate[supported, i].max()), True
     return float(fit.upper[:, i].max()), False
 
 
@@ -156,11 +158,11 @@ def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
     i = fit.terms.index(term)
     tail = 1.0 - fit.level
     below = min(1.0 - fit.level ** (1.0 / len(fit.estimate)), 0.5 * tail)
-    usual, seen = ndtri(0.5 * tail), fit.supported[:, i]
-    centre = np.where(seen, fit.estimate[:, i], 1.0)
+    usual, supported = ndtri(0.5 * tail), fit.supported[:, i]
+    centre = np.where(supported, fit.estimate[:, i], 1.0)
 
     def moved(end: np.ndarray, probability: float) -> float:
-        return float(np.max(np.where(seen, centre * (end / centre) ** (ndtri(probability) / usual), end)))
+        return float(np.max(np.where(supported, centre * (end / centre) ** (ndtri(probability) / usual), end)))
 
     return moved(fit.lower[:, i], below), moved(fit.upper[:, i], tail - below)
 
@@ -201,10 +203,10 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
             ("angle_random_walk", "noise_density", "1/sqrt(Hz)"),
             ("rate_random_walk", "random_walk", "1/s/sqrt(Hz)"),
         ):
-            value, seen = largest(fits[sensor], term)
+            value, supported = largest(fits[sensor], term)
             low, high = (factor * end for end in largest_interval(fits[sensor], term))
             interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
-            note = "" if seen else "; not detected, the upper end of its interval"
+            note = "" if supported else "; not detected, the upper end of its interval"
             lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
     return "\n".join(line for line in lines if line) + "\n"
@@ -244,8 +246,8 @@ def to_px4(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
         ("EKF2_ACC_NOISE", "accelerometer", "angle_random_walk"),
         ("EKF2_ACC_B_NOISE", "accelerometer", "rate_random_walk"),
     ):
-        value, seen = largest(fits[sensor], term)
-        lines += [] if seen else [f"# {parameter}: not detected, the upper end of its interval"]
+        value, supported = largest(fits[sensor], term)
+        lines += [] if supported else [f"# {parameter}: not detected, the upper end of its interval"]
         lines.append(f"1\t1\t{parameter}\t{value / root:.6e}\t9")
     return "\n".join(lines) + "\n"
 
@@ -265,8 +267,8 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     str
         MATLAB code.
     """
-    made = {"gyro": ("Gyroscope", "gyroparams", 1.0), "accelerometer": ("Accelerometer", "accelparams", 1.0)}
-    made["magnetometer"] = ("Magnetometer", "magparams", 1e6)
+    objects = {"gyro": ("Gyroscope", "gyroparams", 1.0), "accelerometer": ("Accelerometer", "accelparams", 1.0)}
+    objects["magnetometer"] = ("Magnetometer", "magparams", 1e6)
     rate = 1.0 / next(iter(fits.values())).sample_interval
     kinds = "-".join(
         word
@@ -280,7 +282,7 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     ]
     lines.append(f"imu = imuSensor('{kinds if kinds in known else 'accel-gyro-mag'}', 'SampleRate', {rate:.6g});")
     for sensor, fit in fits.items():
-        own, make, factor = made[sensor]
+        own, make, factor = objects[sensor]
         values = np.where(fit.supported, fit.estimate, 0.0) * factor
         parts = ["'NoiseType', 'single-sided'"]
         for term, word in (

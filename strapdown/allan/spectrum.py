@@ -148,21 +148,21 @@ def segment(place: slice, dt: float, terms: Sequence[str], highest_frequency: fl
 
 def binned(coefficients: Sequence[Array], segments: Sequence[Segment], dt: float) -> tuple[list[Bins], Bins]:
     """Return the sums over the bins of each segment and of all, by increasing frequency; all segments have the same ramp."""
-    low = [c[1 : min(one.last, 1 << 20) + 1] for c, one in zip(coefficients, segments, strict=True)]
+    low = [c[1 : min(segment.last, 1 << 20) + 1] for c, segment in zip(coefficients, segments, strict=True)]
     ramps = [
         dt * ramp_coefficients(len(c), np.arange(1, len(part) + 1)) for c, part in zip(coefficients, low, strict=True)
     ]
     slope = sum(inner(r, c) for r, c in zip(ramps, low, strict=True)) / sum(inner(r, r) for r in ramps)
     each = []
-    for coefficient, one in zip(coefficients, segments, strict=True):
+    for coefficient, segment in zip(coefficients, segments, strict=True):
         sums = []
-        for s in bin_slices(one.starts, one.last):
+        for s in bin_slices(segment.starts, segment.last):
             ramp = dt * ramp_coefficients(len(coefficient), np.arange(s.start, s.stop))
             rest = coefficient[s] - slope * ramp
             sums.append((len(rest), inner(rest, rest), inner(rest, ramp), inner(ramp, ramp)))
         number, square, product, ramp_square = np.array(sums, dtype=float).T
-        each.append(Bins(number, square, product, ramp_square, one.basis, slope))
-    frequency = [one.starts / len(c) for c, one in zip(coefficients, segments, strict=True)]
+        each.append(Bins(number, square, product, ramp_square, segment.basis, slope))
+    frequency = [segment.starts / len(c) for c, segment in zip(coefficients, segments, strict=True)]
     order = np.argsort(np.concatenate(frequency), kind="stable")
     joined = {
         name: np.concatenate([getattr(bins, name) for bins in each], axis=-1)[..., order]

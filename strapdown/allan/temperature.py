@@ -115,9 +115,9 @@ def fit_temperature(
     coefficients, sigma, reach = np.zeros((3, order + 1, x.shape[1]))
     left = np.empty_like(x)
     for axis in range(x.shape[1]):
-        found, sigma[1:, axis], reach[1:, axis] = _regression(x[:, axis], powers, dt)
-        left[:, axis] = x[:, axis] - np.sum((powers - powers.mean(axis=0)) * found, axis=1)
-        coefficients[:, axis] = float(np.mean(x[:, axis]) - powers.mean(axis=0) @ found), *found
+        slopes, sigma[1:, axis], reach[1:, axis] = _regression(x[:, axis], powers, dt)
+        left[:, axis] = x[:, axis] - np.sum((powers - powers.mean(axis=0)) * slopes, axis=1)
+        coefficients[:, axis] = float(np.mean(x[:, axis]) - powers.mean(axis=0) @ slopes), *slopes
     polynomial = BiasOverTemperature(reference=reference, span=span, coefficients=coefficients, sigma=sigma)
     return TemperatureFit(polynomial, reach, left)
 
@@ -176,7 +176,7 @@ def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array, Array
     variances = np.array([fit.covariance.diagonal() for fit in fits])
     mean = weights @ each
     sigma = np.sqrt(weights @ (variances + (each - mean) ** 2))
-    reach = np.array([_half_width(weights, *one) for one in zip((each - mean).T, np.sqrt(variances).T, strict=True)])
+    reach = np.array([_half_width(weights, *axis) for axis in zip((each - mean).T, np.sqrt(variances).T, strict=True)])
     return (first + mean) / scale, sigma / scale, reach / scale
 
 

@@ -85,9 +85,9 @@ def calibrate(
     used = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not used:
         raise InputError("recordings is empty; give at least one recording")
-    for one in used:
-        instance("recordings", one, Recording, "give recordings, as read returns them")
-    units = {one.magnetic_unit for one in used}
+    for recording in used:
+        instance("recordings", recording, Recording, "give recordings, as read returns them")
+    units = {recording.magnetic_unit for recording in used}
     if len(units) > 1:
         raise InputError(
             f"the units of the recordings' fields are {', '.join(map(repr, units))}; declare one unit for all"
@@ -211,13 +211,13 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
         covariance = J @ covariance @ J.T
     sigma = np.sqrt(np.diag(covariance))
     values = _sensor_errors(x, fit.unknowns.bias[-1], strength)
-    found = UnitCalibration(
+    unit = UnitCalibration(
         **vars(values),
         sigma=_sensor_errors(sigma[:-3], sigma[-3:], strength),
         magnetic_unit=recordings[0].magnetic_unit if len(prior.mean) > fitting.IRON.start else "",
-        source=", ".join(dict.fromkeys(one.source for one in recordings)),
+        source=", ".join(dict.fromkeys(recording.source for recording in recordings)),
     )
-    return replace(found, remarks=missing(found, strength))
+    return replace(unit, remarks=missing(unit, strength))
 
 
 def missing(calibration: UnitCalibration, strength: float = 1.0) -> tuple[str, ...]:

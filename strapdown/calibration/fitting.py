@@ -213,23 +213,23 @@ class Problem:
         node, length, unit = iv.node, iv.length, np.eye(3)
         here, there = size * node, size * (node + 1)
         rotation, glob = x.attitude[node], self.errors_at
-        found = _Equations(self.errors_at + len(x.errors))
+        equations = _Equations(self.errors_at + len(x.errors))
 
         relative = np.swapaxes(rotation @ p.turn, 1, 2) @ x.attitude[node + 1]
         e = Rotation.from_matrix(relative).as_rotvec()
         inverse = np.linalg.inv(right_jacobian(e))
         back = -inverse @ np.swapaxes(relative, 1, 2)
-        found.add(
+        equations.add(
             "rotation", e, noise["rotation"] * np.sqrt(length),
             (here + ATTITUDE, back @ np.swapaxes(p.turn, 1, 2)), (there + ATTITUDE, inverse),
             (here + GYRO_BIAS, 0.5 * back @ p.turn_by[:, :, :3]), (there + GYRO_BIAS, 0.5 * back @ p.turn_by[:, :, :3]),
             (glob, back @ p.turn_by[:, :, 3:]),
         )  # fmt: skip
-        self._process(found, x, "bias", GYRO_BIAS, np.inf, BIAS_SIGMA, noise["bias"] * np.sqrt(length))
-        self._process(found, x, "lever", LEVER, np.inf, LEVER_SIGMA, LEVER_WALK * np.sqrt(length))
+        self._process(equations, x, "bias", GYRO_BIAS, np.inf, BIAS_SIGMA, noise["bias"] * np.sqrt(length))
+        self._process(equations, x, "lever", LEVER, np.inf, LEVER_SIGMA, LEVER_WALK * np.sqrt(length))
         velocity = noise["velocity"] * self.activity
         self._process(
-            found, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, np.sqrt(velocity[node] * velocity[node + 1])
+            equations, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, np.sqrt(velocity[node] * velocity[node + 1])
         )
 
         rate = (iv.node_rate - x.bias) @ np.linalg.inv(unit + errors.gyro_matrix).T
@@ -243,7 +243,7 @@ class Problem:
         force = np.einsum("kij,kj->ki", rotation, p.force.value) - self.gravity * unit[2]
         own = rotation @ p.force.by_own
         own = np.concatenate([own[:, :, :3], own[:, :, 3:12] @ SYMMETRIC, own[:, :, 12:]], axis=2)
-        found.add(
+        equations.add(
             "force", force - (v[node + 1] - v[node]) / length[:, None], sigma,
             (here + ATTITUDE, -rotation @ skew(p.force.value) + by_turn[node] / L), (there + ATTITUDE, -by_turn[node + 1] / L),
             (here + VELOCITY, unit / L), (there + VELOCITY, -unit / L),
@@ -252,24 +252,24 @@ class Problem:
         )  # fmt: skip
         if p.field is not None and iv.field is not None:
             self._process(
-                found, x, "disturbance", DISTURBANCE, DISTURBANCE_TIME, noise["disturbance"], noise["disturbance"]
+                equations, x, "disturbance", DISTURBANCE, DISTURBANCE_TIME, noise["disturbance"], noise["disturbance"]
             )
             dip, number = x.errors[DIP.start], iv.field.number
             sigma = noise["field"] / np.sqrt(np.where(number > 0.0, number, np.finfo(float).tiny))
             d = x.nodes[:, DISTURBANCE - 3 : DISTURBANCE]
             error = np.einsum("kij,kj->ki", rotation, p.field.value) - [0.0, np.cos(dip), -np.sin(dip)]
-            found.add(
+            equations.add(
                 "field", error - 0.5 * (d[node] + d[node + 1]), sigma,
                 (here + ATTITUDE, -rotation @ skew(p.field.value)),
                 (here + DISTURBANCE, -0.5 * unit), (there + DISTURBANCE, -0.5 * unit),
                 (glob + DIP.start, np.array([[0.0], [np.sin(dip)], [np.cos(dip)]])),
                 *self._by_errors(rotation @ p.field.by_turn, rotation @ p.field.by_own, here, there, IRON.start),
             )  # fmt: skip
-        found.add(
+        equations.add(
             "prior", (x.errors - self.prior.mean)[:, None], self.prior.sigma,
             (glob + np.arange(len(x.errors)), np.ones((1, 1))),
         )  # fmt: skip
-        return found
+        return equations
 
     def _by_errors(
         self, by_turn: Array, by_own: Array, here: np.ndarray, there: np.ndarray, place: int
@@ -285,7 +285,7 @@ class Problem:
 
     def _process(
         self,
-        found: _Equations,
+        equations: _Equations,
         x: Unknowns,
         kind: str,
         place: int,
@@ -298,12 +298,12 @@ class Problem:
         decay = np.exp(-self.intervals.length / time)
         drive = np.sqrt(1.0 - decay**2) if np.isfinite(time) else 1.0
         begin = self.intervals.first
-        found.add(
+        equations.add(
             kind, values[node + 1] - decay[:, None] * values[node], sigma * drive,
             (self.size * (node + 1) + place, np.eye(3)), (self.size * node + place, -decay[:, None, None] * np.eye(3)),
         )  # fmt: skip
         kind = kind if kind != "bias" else "start"  # the factor of the random walk's noise is not that of its start
-        found.add(
+        equations.add(
             kind, values[begin], np.broadcast_to(first, len(values))[begin], (self.size * begin + place, np.eye(3))
         )
 
@@ -332,11 +332,11 @@ def solve(problem: Problem, x: Unknowns) -> Fit:
     for kind, factor in factors.items():
         noise[kind] *= max(1.0, factor) ** 0.5
     x = _iterated(problem, x, weak, noise=False)
-    found = problem.equations(x)
-    factor = _factor((found.jacobian.T @ found.jacobian).tocsc() + scipy.sparse.diags(weak, format="csc"))
+    equations = problem.equations(x)
+    factor = _factor((equations.jacobian.T @ equations.jacobian).tocsc() + scipy.sparse.diags(weak, format="csc"))
     bias = problem.size * (len(x.nodes) - 1) + GYRO_BIAS + np.arange(3)
     wanted = np.concatenate([problem.errors_at + np.arange(len(x.errors)), bias])
-    unit = np.zeros((found.columns, len(wanted)))
+    unit = np.zeros((equations.columns, len(wanted)))
     unit[wanted, np.arange(len(wanted))] = 1.0
     return Fit(x, factor.solve(unit)[wanted], noise)
 
@@ -349,13 +349,13 @@ def _iterated(problem: Problem, x: Unknowns, weak: Array, *, noise: bool) -> Unk
     for step in range(MAX_STEPS):
         if noise and step < 2 * FREE_STEPS:
             problem.measure_activity(x)
-        found = problem.equations(x)
-        J = found.jacobian
+        equations = problem.equations(x)
+        J = equations.jacobian
         if noise and step >= FREE_STEPS:
-            changed = _estimate_noise(problem, found, J, _factor((J.T @ J).tocsc() + prior), random)
-            found = problem.equations(x)
-            J = found.jacobian
-        r = found.residual
+            changed = _estimate_noise(problem, equations, J, _factor((J.T @ J).tocsc() + prior), random)
+            equations = problem.equations(x)
+            J = equations.jacobian
+        r = equations.residual
         x, damping, gain = _descended(problem, x, (J.T @ J).tocsc() + prior, J.T @ r, float(r @ r), damping)
         if (not noise or step > 2 * FREE_STEPS) and changed < NOISE_TOLERANCE and gain < 1e-4:
             break
@@ -400,17 +400,17 @@ def _descended(
 
 
 def _estimate_noise(
-    problem: Problem, found: _Equations, J: scipy.sparse.csr_matrix, factor: SuperLU, random: np.random.Generator
+    problem: Problem, equations: _Equations, J: scipy.sparse.csr_matrix, factor: SuperLU, random: np.random.Generator
 ) -> float:
     """Scale the noise of each kind of equation to its residuals; return the largest relative change.
 
     The expected square sum of m residuals is m less the trace of their part of J (JᵀJ)⁻¹ Jᵀ, which is estimated with random signs.
     """
-    signs = random.choice([-1.0, 1.0], (found.rows, PROBES))
+    signs = random.choice([-1.0, 1.0], (equations.rows, PROBES))
     projected = J @ factor.solve(J.T @ signs)
-    residual, changed = found.residual, 0.0
+    residual, changed = equations.residual, 0.0
     for kind, least in problem.floor.items():
-        rows = found.kinds[kind]
+        rows = equations.kinds[kind]
         count = rows.stop - rows.start
         redundancy = max(count - float(np.sum(signs[rows] * projected[rows])) / PROBES, 0.02 * count)
         ratio = np.clip(np.sqrt(float(residual[rows] @ residual[rows]) / redundancy), 0.3, 3.0)

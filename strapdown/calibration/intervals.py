@@ -198,8 +198,8 @@ def predicted(intervals: Intervals, errors: Errors, bias: Array) -> Prediction:
         by = np.swapaxes(small, 1, 2) @ by + right_jacobian(angle) @ change
         turn = turn @ small
         rate = (intervals.rate[:, j] - bias) @ inverse.T
-        for one in sums:
-            one.add(j, turn, by, rate, _by_gyro(inverse, rate, np.ones((count, 1))))
+        for part in sums:
+            part.add(j, turn, by, rate, _by_gyro(inverse, rate, np.ones((count, 1))))
     return Prediction(turn, by, sums[0].mean, sums[1].mean if len(sums) == 2 else None)
 
 

@@ -115,10 +115,10 @@ def export(
     else:
         program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
     origin = _origin(setup, precision)
-    made = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
-    paths = [Path(folder) / name for name in made]
+    texts = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
+    paths = [Path(folder) / name for name in texts]
     writable("folder", *paths)
-    for path, text in zip(paths, made.values(), strict=True):
+    for path, text in zip(paths, texts.values(), strict=True):
         with atomic_write(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return tuple(paths)

@@ -35,10 +35,10 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     """Return the program of a setup for these sensors."""
     _need_exportable(setup)
     series = _series(setup, sensors)
-    kinds: Mapping[str, Any] = {one.sensor: one.kind for one in series}
+    kinds: Mapping[str, Any] = {vectors.sensor: vectors.kind for vectors in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
     temperature.need_none(error_states, EXPORTED)
-    isotropic = not any(one.anisotropic for one in series)
+    isotropic = not any(vectors.anisotropic for vectors in series)
     model = modelling.assemble(error_states, kinds, isotropic=isotropic)
     refuse(EXPORTED, record=model.of_record)
     noise = setup.process_noise
@@ -50,7 +50,8 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
         structure=model.structure,
         model=_plain(numbers),
         sensors=tuple(
-            _sensor(one, int(shape), isotropic=isotropic) for one, shape in zip(series, model.shape, strict=True)
+            _sensor(vectors, int(shape), isotropic=isotropic)
+            for vectors, shape in zip(series, model.shape, strict=True)
         ),
         thresholds=None if setup.gate is None else tuple(float(x) for x in setup.gate.thresholds),
         max_precision=MAX_PRECISION_SINGLE if single else MAX_PRECISION,
@@ -95,17 +96,17 @@ def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasureme
     """Return one measurement of each sensor, with the σ of the setup."""
     if not sensors:
         raise InputError("there is no sensor; give the sensors, a record, or a scenario with sensors")
-    for one in sensors:
-        if isinstance(one, VectorMeasurements) and len(one.time):
+    for sensor in sensors:
+        if isinstance(sensor, VectorMeasurements) and len(sensor.time):
             for name, values in (
-                ("sigma", one.sigma),
-                ("reference_f", one.references_f),
-                ("covariance", one.covariances),
+                ("sigma", sensor.sigma),
+                ("reference_f", sensor.references_f),
+                ("covariance", sensor.covariances),
             ):
-                refuse(f"{one.sensor}: {name} varies, but {EXPORTED}", varying=bool(np.any(values != values[0])))
-    series = [template(one, 0.0) for one in sensors]
+                refuse(f"{sensor.sensor}: {name} varies, but {EXPORTED}", varying=bool(np.any(values != values[0])))
+    series = [template(sensor, 0.0) for sensor in sensors]
     record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
-    identifiers = [identifier(one.sensor) for one in record.vectors]
+    identifiers = [identifier(vectors.sensor) for vectors in record.vectors]
     if len(set(identifiers)) < len(identifiers):
         raise InputError(f"two sensors have the same name in code: {', '.join(identifiers)}; rename one")
     return with_sigma(record, setup).vectors

@@ -415,9 +415,9 @@ class Interpreter:
             parameters = [(n, len(a) if type(a) is tuple else m.type_of(a)) for n, a in numbers.items()]
             words = (function.__doc__ or "").split("\n")[0]
             target = m.another(name, parameters, words)
-            given = [target.argument(n) if n in numbers else target.spaces[n] for n in names]
+            operands = [target.argument(n) if n in numbers else target.spaces[n] for n in names]
             target.kernel.outer = True
-            result = target.kernel._body(function, given)
+            result = target.kernel._body(function, operands)
             if isinstance(result, tuple):
                 target.parameters = [*parameters, ("result", -len(result))]
                 out = target.array(lambda i: f"result[{i}]")

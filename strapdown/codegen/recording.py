@@ -319,8 +319,8 @@ def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
             for half, count in zip(sums, counts, strict=True)
         )
         expected = cross(rate, tuple(-0.25 * starting.QUIET_SPAN * (x + y) for x, y in zip(first, second, strict=True)))
-        seen = tuple(y - x for x, y in zip(first, second, strict=True))
-        agree = agree + m.select(some, dot(seen, expected), 0.0)
+        change = tuple(y - x for x, y in zip(first, second, strict=True))
+        agree = agree + m.select(some, dot(change, expected), 0.0)
         square = square + m.select(some, dot(expected, expected), 0.0)
     turning = dot(rate, rate) > starting.TURNING_RATE**2
     still = (variance < starting.MAX_REST_SIGMA**2) & (f.clock[0] - f.rest_clock[0] < 1.5 * starting.QUIET_SPAN)
@@ -328,14 +328,14 @@ def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
     still = still & m.no(turning & (agree > 0.5 * square))
     drifted = f.rest_variance[1] + r.parameters.rate_random_walk**2 * (f.clock[0] - f.rest_clock[1])
 
-    def found() -> None:
+    def rest_found() -> None:
         f.resting[1] = 1
         f.rest_clock[1] = f.clock[0]
         f.rest_variance[0], f.rest_variance[1] = variance, 1.0 / (1.0 / drifted + 1.0 / variance)
         for i in range(3):
             f.rest_rate[i] = rate[i]
 
-    m.branch(still & (variance < drifted), found)
+    m.branch(still & (variance < drifted), rest_found)
 
 
 def use_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
@@ -423,20 +423,18 @@ def end_field(m: Any, program: Any, f: SimpleNamespace, edges: Any, force: Any, 
         turn_variance=(0.0,),
     )
     shapes = {"direction": (1, 3), "sigma": (1,), "usual": (1, 2), "variance": (1,)}
-    found = SimpleNamespace(
-        iron=m.scratch(), **{name: m.table(f"found_{name}", shape) for name, shape in shapes.items()}
-    )
+    out = SimpleNamespace(iron=m.scratch(), **{name: m.table(f"found_{name}", shape) for name, shape in shapes.items()})
     for i in range(3):
-        found.direction[0, i] = 0.0
-    m.kernel(headings.heading_steps, r.constants, steps, f, found)
+        out.direction[0, i] = 0.0
+    m.kernel(headings.heading_steps, r.constants, steps, f, out)
 
     def turned() -> None:
-        status = m.call("update_magnetometer", row(found.direction), found.sigma[0], result="status")
+        status = m.call("update_magnetometer", row(out.direction), out.sigma[0], result="status")
         nis = m.select(m.equal(status, 0), f.nis[1], 0.0)
         m.kernel(recording_steps.running_mean, (nis,), r.imu.field_mean.arguments[1], f.field_sums, f.field_level)
 
-    m.branch(found.sigma[0] > 0.0, turned)
-    f.scales[3] = found.variance[0]
+    m.branch(out.sigma[0] > 0.0, turned)
+    f.scales[3] = out.variance[0]
 
 
 def carry(m: Any, program: Any, f: SimpleNamespace) -> None:

@@ -95,15 +95,15 @@ class Placement:
                 waiting.extend(symbols_of(statement.values))
         for symbol in waiting:
             self.uses[symbol] = self.uses.get(symbol, 0) + 2  # a root is never written into an expression
-        seen = set()
+        known = set()
         while waiting:
             symbol = waiting.pop()
-            if symbol not in seen:
-                seen.add(symbol)
+            if symbol not in known:
+                known.add(symbol)
                 for operand in operands_of(symbol):
                     self.uses[operand] = self.uses.get(operand, 0) + 1
                     waiting.append(operand)
-        return sorted(seen, key=lambda symbol: symbol.number)
+        return sorted(known, key=lambda symbol: symbol.number)
 
     def _grouped(self) -> None:
         """Group the live selections."""
@@ -163,13 +163,13 @@ class Placement:
 
     def needed(self, values: Iterable[Any], slot: Slot, written: set[Symbol]) -> list[Symbol]:
         """Return the symbols of a slot that are needed for values and not yet written, in order."""
-        waiting, seen = list(symbols_of(values)), set()
+        waiting, visited = list(symbols_of(values)), set()
         while waiting:
             symbol = waiting.pop()
-            if symbol not in seen and symbol not in written:
-                seen.add(symbol)
+            if symbol not in visited and symbol not in written:
+                visited.add(symbol)
                 waiting.extend(operands_of(symbol))
-        return sorted((x for x in seen if self.places[x] is slot), key=lambda symbol: symbol.number)
+        return sorted((x for x in visited if self.places[x] is slot), key=lambda symbol: symbol.number)
 
 
 def values_in(statement: Statement) -> Iterator[Any]:

@@ -174,7 +174,7 @@ def traced(program: Program) -> list[Target]:
 
     r, work = program.recording, ("work", -work_size(program.kernels))
     coefficients = [function(body.prepare, ("dt", 0))] if program.structure.chains else []
-    made = [
+    functions = [
         function(body.far_turn, ("x", 0), ("y", 0), ("z", 0), ("turn", -13)),
         *coefficients,
         function(body.step, ("delta", 3), ("dt", 0)),
@@ -183,20 +183,20 @@ def traced(program: Program) -> list[Target]:
         function(body.apply_step, work),
     ]
     if r is None:
-        made.append(function(body.init, ("attitude", 4), returns="status"))
-        made.append(function(body.predict, ("gyro", 3), ("dt", 0), returns="status"))
+        functions.append(function(body.init, ("attitude", 4), returns="status"))
+        functions.append(function(body.predict, ("gyro", 3), ("dt", 0), returns="status"))
     else:
-        made.append(function(body.propagate, ("delta", 3), ("dt", 0), returns="status"))
+        functions.append(function(body.propagate, ("delta", 3), ("dt", 0), returns="status"))
     for index, sensor in enumerate(program.sensors):
         values = [("value", sensor.size), *([] if r is None else [("sigma", 0)])]
         named: dict[str, Any] = {"name": f"update_{sensor.name}", "words": sensor.words, "more": (sensor, index)}
-        made.append(function(body.update, *values, returns="status", **named))
+        functions.append(function(body.update, *values, returns="status", **named))
     if r is None:
-        return made
+        return functions
     last = [] if r.rest is None else [function(recording.find_rest), function(recording.use_rest)]
     last += [function(recording.carry), function(recording.end_step), function(recording.init, returns="status")]
     sample = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)][: 3 + r.magnetometer]
     words = " ".join((recording.update.__doc__ or "").split())
     words = words if r.magnetometer else words.partition(" magnetometer:")[0]
     last.append(function(recording.update, *sample, returns="status", words=words))
-    return made + [target for target, _ in kernels.values()] + last
+    return functions + [target for target, _ in kernels.values()] + last

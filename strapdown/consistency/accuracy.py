@@ -142,17 +142,17 @@ class Accuracy(Listed):
     def rms_over_sigma(self) -> dict[str, float]:
         """RMS error over σ by part, over all samples as given; empty without a covariance."""
         sizes = self.given.get("all samples", {})
-        return {kind: one.rms_over_sigma for kind, one in sizes.items() if math.isfinite(one.rms_over_sigma)}
+        return {kind: size.rms_over_sigma for kind, size in sizes.items() if math.isfinite(size.rms_over_sigma)}
 
     def listing(self) -> Table:
         """Return the errors as given and aligned, by span and part, in degrees."""
         rows = []
         for words, table in (("as given", self.given), ("aligned", self.aligned)):
             for span, sizes in table.items():
-                for kind, one in sizes.items():
-                    angles = (x / DEGREE for x in one[:3])
-                    share = "" if math.isnan(one.coverage) else f"{100.0 * one.coverage:.1f} %"
-                    ratio = "" if math.isnan(one.rms_over_sigma) else one.rms_over_sigma
+                for kind, size in sizes.items():
+                    angles = (x / DEGREE for x in size[:3])
+                    share = "" if math.isnan(size.coverage) else f"{100.0 * size.coverage:.1f} %"
+                    ratio = "" if math.isnan(size.rms_over_sigma) else size.rms_over_sigma
                     rows.append((span, words, kind, *angles, share, ratio))
         notes = [
             "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter."
@@ -190,23 +190,23 @@ class Accuracy(Listed):
             return {
                 span: {
                     kind: {
-                        **{f"{name}_deg": getattr(one, name) / DEGREE for name in ("rms", "median", "maximum")},
-                        "coverage": one.coverage,
-                        "rms_over_sigma": one.rms_over_sigma,
+                        **{f"{name}_deg": getattr(size, name) / DEGREE for name in ("rms", "median", "maximum")},
+                        "coverage": size.coverage,
+                        "rms_over_sigma": size.rms_over_sigma,
                     }
-                    for kind, one in sizes.items()
+                    for kind, size in sizes.items()
                 }
                 for span, sizes in table.items()
             }
 
-        found = {"samples": dict(self.samples), "given": angles(self.given), "aligned": angles(self.aligned)}
+        summary = {"samples": dict(self.samples), "given": angles(self.given), "aligned": angles(self.aligned)}
         if self.bias is not None:
-            found["bias"] = dict(
+            summary["bias"] = dict(
                 zip(("rms_deg_per_h", "sigma_deg_per_h"), np.divide(self.bias, DEGREE_PER_HOUR), strict=True)
             )
         if self.alignment is not None:
-            found["alignment"] = self.alignment.summary()
-        return plain(found)  # type: ignore[no-any-return]
+            summary["alignment"] = self.alignment.summary()
+        return plain(summary)  # type: ignore[no-any-return]
 
 
 def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = False) -> Accuracy:
@@ -235,16 +235,16 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     P = estimate.attitude_covariance
     own = Series(estimate.time, estimate.attitude, P if np.isfinite(P).all() else None)
     theirs = truth.taken(known)
-    given = _sizes(own.attitude[known], theirs, None if own.covariance is None else P[known])
-    found: Alignment | None = None
+    as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else P[known])
+    alignment: Alignment | None = None
     aligned: dict[str, dict[str, ErrorSize]] = {}
     if align:
-        found, aligned, _ = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
+        alignment, aligned, _ = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
     bias = None
     if truth.has_bias and estimate.has_bias:
         squares = np.sum((estimate.bias - truth.bias) ** 2, axis=1), np.sum(estimate.variance[:, 3:], axis=1)
-        bias = tuple(float(np.sqrt(np.mean(one))) for one in squares)
-    return Accuracy(samples=_numbers(theirs), given=given, aligned=aligned, alignment=found, bias=bias)  # type: ignore[arg-type]
+        bias = tuple(float(np.sqrt(np.mean(square))) for square in squares)
+    return Accuracy(samples=_numbers(theirs), given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]
 
 
 def accuracy_of(own: Series, theirs: Series) -> Accuracy:
@@ -252,21 +252,21 @@ def accuracy_of(own: Series, theirs: Series) -> Accuracy:
 
     The errors as given are left out if the two have no times in common.
     """
-    found, aligned, samples = _aligned_sizes(own, theirs)
-    given: dict[str, dict[str, ErrorSize]] = {}
+    alignment, aligned, samples = _aligned_sizes(own, theirs)
+    as_stored: dict[str, dict[str, ErrorSize]] = {}
     with contextlib.suppress(InputError):
         matched, truth = at_common_times(own, theirs, 0.0)
         P = None if matched.covariance is None else matched.covariance[:, :3, :3]
-        given, samples = _sizes(matched.attitude, truth, P), _numbers(truth)
-    return Accuracy(samples=samples, given=given, aligned=aligned, alignment=found)
+        as_stored, samples = _sizes(matched.attitude, truth, P), _numbers(truth)
+    return Accuracy(samples=samples, given=as_stored, aligned=aligned, alignment=alignment)
 
 
 def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]], dict[str, int]]:
     """Return the alignment of two histories, the errors after it, and the number of samples by span."""
     thin = slice(None, None, max(1, len(own.time) // FITTED))
-    _, found = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
-    matched, truth = at_common_times(own, theirs, found.offset)
-    return found, _sizes(in_truth_frames(matched.attitude, found), truth, None), _numbers(truth)
+    _, alignment = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
+    matched, truth = at_common_times(own, theirs, alignment.offset)
+    return alignment, _sizes(in_truth_frames(matched.attitude, alignment), truth, None), _numbers(truth)
 
 
 def _numbers(truth: Truth) -> dict[str, int]:
@@ -277,14 +277,14 @@ def _numbers(truth: Truth) -> dict[str, int]:
 
 def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:
     """Return the sizes of the errors by span and part; P (m, 3, 3) is the covariance of the body-side error."""
-    found = reference_errors(attitude, truth.attitude)
+    errors = reference_errors(attitude, truth.attitude)
     squares = None if P is None else _normalised(attitude, truth.attitude, P)
     spans = {"all samples": np.ones(len(attitude), bool)}
     if truth.movement is not None and truth.movement.any():
         spans["movement"] = truth.movement
     return {
         span: {
-            kind: _size(kind, getattr(found, kind)[rows], None if squares is None else squares[kind][rows])
+            kind: _size(kind, getattr(errors, kind)[rows], None if squares is None else squares[kind][rows])
             for kind in KINDS
         }
         for span, rows in spans.items()

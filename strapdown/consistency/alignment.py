@@ -69,20 +69,20 @@ class Alignment:
     @property
     def words(self) -> tuple[str, ...]:
         """Differences that were removed, one sentence each."""
-        found = []
+        words = []
         if "time" in self.estimated:
-            found.append(
+            words.append(
                 f"clocks differ by {self.offset:.6g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
             )
         for name, rotation, rows in (("fixed", self.fixed, slice(0, 3)), ("body", self.body, slice(3, 6))):
             if name in self.estimated:
                 text = ", ".join(f"{x / DEGREE:.4g}" for x in rotation)
                 sigma = float(np.sqrt(np.mean(self.sigma[rows] ** 2))) / DEGREE
-                found.append(
+                words.append(
                     f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
                     "axis: removed; a constant error of the filter would look the same"
                 )
-        return tuple(found)
+        return tuple(words)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,9 @@ class Series:
 
     def at(self, rows: np.ndarray, time: Array, attitude: Array) -> Series:
         """Return the given times and attitudes with the covariances and biases of these rows."""
-        P, bias, movement = (None if one is None else one[rows] for one in (self.covariance, self.bias, self.movement))
+        P, bias, movement = (
+            None if column is None else column[rows] for column in (self.covariance, self.bias, self.movement)
+        )
         return Series(time, attitude, P, bias, movement)
 
 
@@ -125,9 +127,9 @@ def in_truth_frames(attitude: Array, alignment: Alignment) -> Array:
     )
 
 
-def turns(one: Array, other: Array) -> Array:
+def turns(first: Array, other: Array) -> Array:
     """Return the rotation vectors (m, 3), rad, body axes, from attitudes (m, 4) to others."""
-    return quaternion.log(quaternion.multiply(quaternion.conjugate(one), other))
+    return quaternion.log(quaternion.multiply(quaternion.conjugate(first), other))
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
@@ -215,7 +217,7 @@ def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
         return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
 
-    found = [(identity, identity), (fixed_of(identity), identity)]
+    pairs = [(identity, identity), (fixed_of(identity), identity)]
     _, w_own = rates(matched)
     _, w_true = rates(Series(matched.time, truth.attitude))
     # Wahba's problem: w_true = Bᵀ w_own.
@@ -223,8 +225,8 @@ def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple
     if s[1] > 1e-3 * s[0]:
         B = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
         body = quaternion.from_matrix(B)
-        found.append((fixed_of(body), body))
-    return found
+        pairs.append((fixed_of(body), body))
+    return pairs
 
 
 def fit(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> Alignment:
@@ -235,9 +237,9 @@ def fit(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> A
     for fixed, body in starts:
         if (not free[0] and abs(fixed[0]) < 1.0) or (not free[3] and abs(body[0]) < 1.0):
             continue
-        found = _descended(own, theirs, free, fixed, body, offset, names)
-        if best is None or found.residual < 0.999 * best.residual:
-            best = found
+        fitted = _descended(own, theirs, free, fixed, body, offset, names)
+        if best is None or fitted.residual < 0.999 * best.residual:
+            best = fitted
     assert best is not None
     return best
 
@@ -259,8 +261,8 @@ def _descended(
         information = np.einsum("mij,mik->jk", J, J)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         value, vector = np.linalg.eigh(information * np.outer(scale, scale))
-        seen = value > 1e-6 * value[-1]  # directions that the motion does not determine are left unchanged
-        inverse = (vector[:, seen] / value[seen]) @ vector[:, seen].T * np.outer(scale, scale)
+        determined = value > 1e-6 * value[-1]  # directions that the motion does not determine are left unchanged
+        inverse = (vector[:, determined] / value[determined]) @ vector[:, determined].T * np.outer(scale, scale)
         step = np.zeros(7)
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
         left = r - np.einsum("mij,j->mi", J, step[free])
@@ -318,16 +320,16 @@ def align_series(
     base = whole.offset if moved else 0.0
     trials = (moved, ("fixed", *moved), ("body", *moved), ("fixed", "body", *moved))
     for names in trials:
-        found = fit(own, theirs, names, base)
-        if found.residual < max(GROSS if names == moved else 0.0, 1.5 * whole.residual):
+        fitted = fit(own, theirs, names, base)
+        if fitted.residual < max(GROSS if names == moved else 0.0, 1.5 * whole.residual):
             break
-    return own, found
+    return own, fitted
 
 
-def _gross(found: Alignment) -> int:
+def _gross(fitted: Alignment) -> int:
     """Return the number of gross rotations, plus 3 if even with them the residual is gross."""
-    turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (found.fixed, found.body))
-    return turned + (3 if found.residual > GROSS else 0)
+    turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (fitted.fixed, fitted.body))
+    return turned + (3 if fitted.residual > GROSS else 0)
 
 
 _CONVENTIONS = {

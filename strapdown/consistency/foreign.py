@@ -104,7 +104,14 @@ class Checked:
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
         rows = [
-            (one.name, one.value, one.nees, one.p_value, "likely" if one.likely else "no") for one in self.explanations
+            (
+                explanation.name,
+                explanation.value,
+                explanation.nees,
+                explanation.p_value,
+                "likely" if explanation.likely else "no",
+            )
+            for explanation in self.explanations
         ]
         columns = ("cause", "size", "remaining NEES", Column("p-value", digits=2), "")
         return Table("Possible causes of the attitude errors", columns, rows, left=2)
@@ -122,7 +129,7 @@ class Checked:
             **self.judgement.summary(),
             "error_frame": self.error_frame,
             "error_frame_probability": dict(self.frame_probability),
-            "explanations": [vars(one) for one in self.explanations],
+            "explanations": [vars(explanation) for explanation in self.explanations],
             "remarks": list(self.remarks),
             "accuracy": None if self.accuracy is None else self.accuracy.summary(),
         }
@@ -226,44 +233,44 @@ def _checked(
     if own.covariance is None:
         estimate = without_truth(own.time, aligned, innovations)
         judgement = judge(estimate, truth, **how)
-        chosen, found, explained = "", dict[str, float](), tuple[Explanation, ...]()
+        frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:
         readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
         readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
         error = turns(aligned, truth.attitude)
-        found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-        chosen, words = _chosen_frame(error_frame, found)
+        probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
+        frame, words = _chosen_frame(error_frame, probabilities)
         remarks += words
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         turned = None if own.bias is None else quaternion.rotate(body, own.bias)
-        estimate = Estimate.from_arrays(own.time, aligned, readings[chosen], bias=turned, innovations=innovations)
+        estimate = Estimate.from_arrays(own.time, aligned, readings[frame], bias=turned, innovations=innovations)
         judgement = judge(estimate, truth, **how)
         assert whole.covariance is not None
-        whole = replace(whole, covariance=read_as(chosen, whole.covariance, whole.attitude))
+        whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
         moved, level = Series(own.time, aligned, bias=own.bias), how["confidence_level"]
-        explained = explanations(error, readings, chosen, found, truth, moved, confidence_level=level)
+        explained = explanations(error, readings, frame, probabilities, truth, moved, confidence_level=level)
     return Checked(
         judgement=judgement,
         estimate=estimate,
         truth=truth,
         alignment=alignment,
-        error_frame=chosen,
-        frame_probability=found if error_frame == "find" else {},
+        error_frame=frame,
+        frame_probability=probabilities if error_frame == "find" else {},
         explanations=explained,
         remarks=tuple(remarks),
         accuracy=accuracy_of(whole, theirs),
     )
 
 
-def _chosen_frame(given: str, found: Mapping[str, float]) -> tuple[str, list[str]]:
+def _chosen_frame(wanted: str, probabilities: Mapping[str, float]) -> tuple[str, list[str]]:
     """Return the definition of the covariance, given or found, and the remark on it."""
-    best = max(found, key=lambda name: found[name])
-    if given == "find":
-        chosen = best if found[best] >= DECIDED else "body"
-        return chosen, [_frame_words(chosen, found)]
-    if found[given] < 0.01:
-        return given, [f"the covariance is read as {given}, as given; the errors fit far better read as {best}"]
-    return given, []
+    best = max(probabilities, key=lambda name: probabilities[name])
+    if wanted == "find":
+        frame = best if probabilities[best] >= DECIDED else "body"
+        return frame, [_frame_words(frame, probabilities)]
+    if probabilities[wanted] < 0.01:
+        return wanted, [f"the covariance is read as {wanted}, as given; the errors fit far better read as {best}"]
+    return wanted, []
 
 
 def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
@@ -318,14 +325,14 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
     return {name: value / sum(likelihood.values()) for name, value in likelihood.items()}
 
 
-def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
-    said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
-    if found[chosen] < DECIDED:
+def _frame_words(frame: str, probabilities: Mapping[str, float]) -> str:
+    said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in probabilities.items())
+    if probabilities[frame] < DECIDED:
         return (
-            f"the errors do not decide how the covariance is defined ({said}): it is read as {chosen}; "
+            f"the errors do not decide how the covariance is defined ({said}): it is read as {frame}; "
             f"{Hint('error_frame')} names another"
         )
-    return f"the covariance is read as {chosen} ({said}, found from the errors)"
+    return f"the covariance is read as {frame} ({said}, found from the errors)"
 
 
 def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) -> Array:
@@ -346,7 +353,7 @@ def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) ->
 def explanations(
     error: Array,
     readings: Mapping[str, Array],
-    chosen: str,
+    frame: str,
     probabilities: Mapping[str, float],
     truth: Truth,
     own: Series,
@@ -357,20 +364,22 @@ def explanations(
 
     ``own`` is the aligned estimate. For a consistent filter none is likely with ``confidence_level``.
     """
-    P = readings[chosen]
-    found = [
+    P = readings[frame]
+    candidates = [
         *_constant_differences(error, P[:, :3, :3], jacobian(own.time, own.attitude, truth)),
         _wrong_scale(whitened(error, P[:, :3, :3])),
         *_zero_bias(own, truth, P),
-        *_other_frames(error, readings, chosen, probabilities),
+        *_other_frames(error, readings, frame, probabilities),
     ]
-    order = sorted(found, key=lambda one: one.p_value)
-    for rank, one in enumerate(order):  # Holm
-        if one.p_value > (1.0 - confidence_level) / (len(order) - rank):
+    order = sorted(candidates, key=lambda candidate: candidate.p_value)
+    for rank, explanation in enumerate(order):  # Holm
+        if explanation.p_value > (1.0 - confidence_level) / (len(order) - rank):
             break
-        order[rank] = replace(one, likely=True)
+        order[rank] = replace(explanation, likely=True)
     # Specific causes come before a factor on σ, which would absorb all of them.
-    return tuple(sorted(order, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))
+    return tuple(
+        sorted(order, key=lambda explanation: (not explanation.likely, explanation.name == SCALE, explanation.p_value))
+    )
 
 
 def _constant_differences(error: Array, P: Array, derivatives: Array) -> Iterator[Explanation]:
@@ -413,18 +422,18 @@ def _zero_bias(own: Series, truth: Truth, P: Array) -> Iterator[Explanation]:
 
 
 def _other_frames(
-    error: Array, readings: Mapping[str, Array], chosen: str, probabilities: Mapping[str, float]
+    error: Array, readings: Mapping[str, Array], frame: str, probabilities: Mapping[str, float]
 ) -> Iterator[Explanation]:
     """Yield the definitions of the covariance that the errors fit better than the one used."""
     for name, P in readings.items():
-        if name == chosen or probabilities[name] <= probabilities[chosen]:
+        if name == frame or probabilities[name] <= probabilities[frame]:
             continue
         white = whitened(error, P[:, :3, :3])
         yield Explanation(
             name=f"covariance meant as {name}",
             value=f"{100.0 * probabilities[name]:.3g} %",
             nees=float(np.mean(white * white)),
-            p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
+            p_value=min(1.0, probabilities[frame] / max(probabilities[name], 1e-300)),
         )
 
 

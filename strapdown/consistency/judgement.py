@@ -191,7 +191,7 @@ class Judgement(Listed):
     @property
     def innovations_untested(self) -> bool:
         """Whether the innovations of a sensor are too few to detect the error ``required``."""
-        return any(one.of.startswith(INNOVATIONS) and one.detectable_error > self.required for one in self.parts)
+        return any(part.of.startswith(INNOVATIONS) and part.detectable_error > self.required for part in self.parts)
 
     @property
     def headline(self) -> str:
@@ -202,15 +202,15 @@ class Judgement(Listed):
         """Return the verdict and each statistic with its bounds, as a table."""
         rows = [
             (
-                one.name,
-                one.label,
-                one.value,
-                f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
-                one.p_value,
-                float(one.samples),
-                "FAIL" if one.rejected else "pass",
+                finding.name,
+                finding.label,
+                finding.value,
+                f"{figure(finding.low)} to {figure(finding.high)}" if math.isfinite(finding.low) else "",
+                finding.p_value,
+                float(finding.samples),
+                "FAIL" if finding.rejected else "pass",
             )
-            for one in self.findings
+            for finding in self.findings
         ]
         columns = (
             "statistic",
@@ -226,7 +226,7 @@ class Judgement(Listed):
             f"{100.0 * (1.0 - self.confidence_level):.2g} %. Each p-value is for one statistic; NIS and NEES are per degree of freedom; of "
             "correlated samples the effective number is given."
         )
-        notes = [*([meaning] if rows else []), *(f"Note: {one}." for one in self.limits)]
+        notes = [*([meaning] if rows else []), *(f"Note: {limit}." for limit in self.limits)]
         return Table(self.headline, columns, rows, notes, left=2)
 
     @property
@@ -249,9 +249,11 @@ class Judgement(Listed):
             "reason": self.reason,
             "headline": self.headline,
             "confidence_level": self.confidence_level,
-            "findings": [{**vars(one), "means": one.means if one.rejected else ""} for one in self.findings],
+            "findings": [
+                {**vars(finding), "means": finding.means if finding.rejected else ""} for finding in self.findings
+            ],
             "limits": self.limits,
-            "parts": [vars(one) for one in self.parts],
+            "parts": [vars(part) for part in self.parts],
             "required": self.required,
             "unmodelled": self.unmodelled,
         }
@@ -338,12 +340,18 @@ def _bounded(
     rules: Mapping[str, Any],
 ) -> Judgement:
     """Return the verdict on a filter whose σ are upper bounds: one-sided tests of the ratios only."""
-    ratios = [replace(one, p_value=one.p_value if one.value > 1.0 else 1.0) for one in findings if one.is_ratio]
+    ratios = [
+        replace(finding, p_value=finding.p_value if finding.value > 1.0 else 1.0)
+        for finding in findings
+        if finding.is_ratio
+    ]
     judged = concluded(ratios, limits, confidence_level, parts=parts, agree="within σ", **rules)
-    judged = replace(judged, findings=tuple(replace(one, low=0.0) for one in judged.findings))
+    judged = replace(judged, findings=tuple(replace(finding, low=0.0) for finding in judged.findings))
     if judged.verdict == "not consistent" or not ratios:
         return judged
-    sizes = [f"innovations of {one.of} {math.sqrt(one.value):.2g}" for one in ratios if one.name == "NIS"]
+    sizes = [
+        f"innovations of {finding.of} {math.sqrt(finding.value):.2g}" for finding in ratios if finding.name == "NIS"
+    ]
     if truth is not None:
         table = accuracy(estimate, truth)
         sizes = [f"{kind} {table.rms_over_sigma[kind]:.2g}" for kind in KINDS if kind in table.rms_over_sigma] + sizes
@@ -392,8 +400,8 @@ def innovation_words(sensor: str, mean: float) -> str:
 
 
 def _of_pairs(estimate: Estimate) -> list[Finding]:
-    found = []
-    for (one, a), (other, b) in itertools.combinations(estimate.innovations.items(), 2):
+    findings = []
+    for (sensor, a), (other, b) in itertools.combinations(estimate.innovations.items(), 2):
         if min(int(a.used.sum()), int(b.used.sum())) < MIN_SAMPLES:
             continue
         series = (a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used])
@@ -401,10 +409,12 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
         if math.isnan(p):
             continue
         largest = float(np.max(np.abs(correlation)))
-        means = f"innovations of {one} and {other} are correlated: they share an error that the filter does not model"
-        of = f"{one} and {other}"
-        found.append(Finding(name="cross-correlation", of=of, value=largest, p_value=p, samples=pairs, means=means))
-    return found
+        means = (
+            f"innovations of {sensor} and {other} are correlated: they share an error that the filter does not model"
+        )
+        of = f"{sensor} and {other}"
+        findings.append(Finding(name="cross-correlation", of=of, value=largest, p_value=p, samples=pairs, means=means))
+    return findings
 
 
 def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: dict[str, str]) -> list[Finding]:
@@ -415,13 +425,13 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
             f"truth has {len(truth.attitude)} attitudes and {len(np.atleast_1d(truth.bias))} biases, the estimate {m} times; "
             "give the truth at the estimate's own times"
         )
-    seen = ~np.isnan(truth.attitude).all(axis=1)
-    if not seen.any():
+    has_truth = ~np.isnan(truth.attitude).all(axis=1)
+    if not has_truth.any():
         limits.append("the reference has no attitude")
         return []
-    attitude = unit_quaternions("truth.attitude", truth.attitude[seen])
-    e = errors(estimate.attitude[seen], estimate.bias[seen], attitude, truth.bias[seen])
-    variance = estimate.variance[seen]
+    attitude = unit_quaternions("truth.attitude", truth.attitude[has_truth])
+    e = errors(estimate.attitude[has_truth], estimate.bias[has_truth], attitude, truth.bias[has_truth])
+    variance = estimate.variance[has_truth]
     # The filter or the reference may have no bias.
     known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
     tested = STATES[: known // 3]
@@ -431,15 +441,15 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
         )
         untested |= dict.fromkeys(tested, "no full covariances")
         return [_largest_at_end(e[-1], variance[-1])]
-    e, P = e[:, :known], estimate.covariance[seen][:, :known, :known]
+    e, P = e[:, :known], estimate.covariance[has_truth][:, :known, :known]
     untested |= dict.fromkeys(tested, "")
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for subset, states in SUBSETS.items():
         if max(states) >= known:
             continue
         value = float(nees(e[-1], P[-1], states)) / len(states)
         words = error_words(f"the {subset} error at the end", value)
-        found.append(ratio("NEES at the end", subset, value, len(states), 1, words))
+        findings.append(ratio("NEES at the end", subset, value, len(states), 1, words))
         why = ""
         if len(e) < FEWEST_TO_AVERAGE:
             why = "too few epochs with a truth"
@@ -450,12 +460,12 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
             words = error_words(f"the {subset} error over the run", average.mean)
             if average.reliable:
                 size = (average.mean, len(states), average.effective)
-                found.append(ratio("time-averaged NEES", subset, *size, words, average.certainty))
+                findings.append(ratio("time-averaged NEES", subset, *size, words, average.certainty))
             else:
                 why = f"its error changes too slowly for this run, {average.effective:.2g} effective samples"
         if subset in untested:
             untested[subset] = why
-    return found
+    return findings
 
 
 def _largest_at_end(error: Array, variance: Array) -> Finding:
@@ -505,11 +515,11 @@ def concluded(
     for; ``runs``: the runs, in words; ``agree``: what is said of the parts that were tested.
     """
     marked = holm(findings, 1.0 - confidence_level)
-    kept = sum(not one.rejected for one in marked)
+    kept = sum(not finding.rejected for finding in marked)
     # Bounds at the significance level at which Holm's procedure has stopped.
-    marked = [one._with_bounds((1.0 - confidence_level) / max(kept, 1)) for one in marked]
-    seen = detectable_errors(marked, confidence_level)
-    tested = tuple(Part(of=of, detectable_error=seen.get(of, math.inf), why=why) for of, why in parts.items())
+    marked = [finding._with_bounds((1.0 - confidence_level) / max(kept, 1)) for finding in marked]
+    errors = detectable_errors(marked, confidence_level)
+    tested = tuple(Part(of=of, detectable_error=errors.get(of, math.inf), why=why) for of, why in parts.items())
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
     if rejected:
@@ -550,29 +560,31 @@ def detectable_errors(findings: Sequence[Finding], confidence_level: float) -> d
     """
     within = (1.0 - confidence_level) / max(len(findings), 1)
     best: dict[str, float] = {}
-    for one in findings:
-        if not one.is_ratio:
+    for finding in findings:
+        if not finding.is_ratio:
             continue
-        low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs, certainty=one.certainty)
-        of = f"{INNOVATIONS}{one.of}" if one.name == "NIS" else one.of
+        low, high = mean_bounds(
+            finding.degrees, finding.samples, 1.0 - within / finding.epochs, certainty=finding.certainty
+        )
+        of = f"{INNOVATIONS}{finding.of}" if finding.name == "NIS" else finding.of
         best[of] = min(best.get(of, math.inf), math.sqrt(high / low) if low > 0.0 else math.inf)
     return best
 
 
 def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> tuple[Answer, str]:
     """Return the verdict if no test contradicts the filter, and which parts were tested."""
-    tested = [one for one in parts if one.detectable_error <= required]
-    others = [one for one in parts if one.detectable_error > required]
-    factors = ", ".join(f"{one.of} ×{math.ceil(100.0 * one.detectable_error) / 100.0:g}" for one in tested)
+    tested = [part for part in parts if part.detectable_error <= required]
+    others = [part for part in parts if part.detectable_error > required]
+    factors = ", ".join(f"{part.of} ×{math.ceil(100.0 * part.detectable_error) / 100.0:g}" for part in tested)
     powers = f"; detectable error of σ: {factors}" if tested else ""
     if not others:
         return ("consistent", f"{_named(tested, parts)}{powers}") if tested else ("cannot tell", "no σ was tested")
     reasons: dict[str, list[Part]] = {}
-    for one in others:
-        coarse = f"only an error of σ of ×{one.detectable_error:.2g} or more is detectable"
+    for other in others:
+        coarse = f"only an error of σ of ×{other.detectable_error:.2g} or more is detectable"
         reasons.setdefault(
-            one.why or (coarse if math.isfinite(one.detectable_error) else "too few samples"), []
-        ).append(one)
+            other.why or (coarse if math.isfinite(other.detectable_error) else "too few samples"), []
+        ).append(other)
     untested = "; ".join(f"{_named(part, parts)} not testable from {runs}: {why}" for why, part in reasons.items())
     agrees = f"{_named(tested, parts)} {agree}; " if tested else ""
     return "cannot tell", f"{agrees}{untested}{powers}"
@@ -580,9 +592,9 @@ def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> 
 
 def _named(some: Sequence[Part], parts: Sequence[Part]) -> str:
     """Return the names of some of the parts, those of all sensors' innovations together as "innovations"."""
-    sensors = [one.of for one in some if one.of.startswith(INNOVATIONS)]
-    every = [one.of for one in parts if one.of.startswith(INNOVATIONS)]
-    names = [one.of for one in some if one.of not in sensors]
+    sensors = [part.of for part in some if part.of.startswith(INNOVATIONS)]
+    every = [part.of for part in parts if part.of.startswith(INNOVATIONS)]
+    names = [part.of for part in some if part.of not in sensors]
     if sensors:
         of = listed([name.removeprefix(INNOVATIONS) for name in sensors])
         names.append("innovations" if sensors == every else f"{INNOVATIONS}{of}")

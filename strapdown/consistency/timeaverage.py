@@ -57,16 +57,16 @@ def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...
     e = array("error", error, ("epochs", "n"))
     P = array("covariance", covariance, (len(e), e.shape[1], e.shape[1]))
     n = e.shape[1]
-    chosen = list(range(n)) if states is None else list(states)
+    subset = list(range(n)) if states is None else list(states)
     if len(e) < 2 * n + 2:
         raise InputError(f"{len(e)} epochs are too few for a time average of {n} states; keep more of the run")
     stride = -(-len(e) // MAX_EPOCHS)
-    order = [*chosen, *(k for k in range(n) if k not in chosen)]
+    order = [*subset, *(k for k in range(n) if k not in subset)]
     white = whitened(e[::stride][:, order], P[::stride][:, order][:, :, order])
-    mine = white[:, : len(chosen)]
+    mine = white[:, : len(subset)]
     return TimeAverage(
-        mean=float(np.mean(np.sum(mine * mine, axis=1)) / len(chosen)),
-        effective=_effective(white, len(chosen)),
+        mean=float(np.mean(np.sum(mine * mine, axis=1)) / len(subset)),
+        effective=_effective(white, len(subset)),
     )
 
 
@@ -76,15 +76,15 @@ def _effective(white: np.ndarray, first: int) -> float:
     A sum of a fast and a slow error is no Markov process, as the six states of a filter with further error states are not: from one epoch
     to the next the fast part hides the correlation of the slow. A thinned series of white appearance says nothing.
     """
-    found = [effective_samples(white, first), squares_effective(white[:, :first])]
+    sizes = [effective_samples(white, first), squares_effective(white[:, :first])]
     stride, rows = 2, max(MIN_ROWS, 8 * (white.shape[1] + 1))
     while len(white) // stride >= rows:
         part = white[::stride]
         slow = effective_samples(part, first)
         if slow < 0.5 * len(part):
-            found.append(slow)
+            sizes.append(slow)
         stride *= 2
-    return min(found)
+    return min(sizes)
 
 
 def squares_effective(white: ArrayLike) -> float:

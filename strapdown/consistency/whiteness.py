@@ -167,5 +167,5 @@ def cross_correlation_p_value(
 
 
 def _series(whitened: ArrayLike) -> Array:
-    given = numbers("whitened", whitened)
-    return array("whitened", given[:, None] if given.ndim == 1 else given, ("m", "dof"))
+    values = numbers("whitened", whitened)
+    return array("whitened", values[:, None] if values.ndim == 1 else values, ("m", "dof"))

@@ -99,7 +99,7 @@ def analyse(
     out = _propagated(scenario, path, random, columns, len(fixed))
     sizes = sizes_of(path, columns, out.residual)
     real = [k for k, column in enumerate(fixed) if column.sensor < 0 or sizes[k] > MIN_ERROR]
-    found = Analysis(
+    analysis = Analysis(
         time=scenario.edges[path.kept],
         filter_covariance=out.P[:, 0] + _fast_bias(setup, len(out.P)),
         sources=tuple(random.names),
@@ -112,7 +112,7 @@ def analyse(
         left_out=_left_out(scenario, setup),
         beyond_linear=_beyond_linear(attitude_sigma, columns, sizes, consider),
     )
-    return dataclasses.replace(found, beyond_linear=(*found.beyond_linear, *_attitude_beyond_linear(found)))
+    return dataclasses.replace(analysis, beyond_linear=(*analysis.beyond_linear, *_attitude_beyond_linear(analysis)))
 
 
 def _fast_bias(setup: FilterSetup, epochs: int) -> Array:
@@ -222,38 +222,38 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
         "timestamp_offset",
         "drop_probability",
     )
-    found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
+    terms = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
     if spec.temperature is not None:
-        found.append("gyro bias over temperature")
+        terms.append("gyro bias over temperature")
     if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):
-        found.append("states for the gyro bias over temperature")
-    found += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
-    return tuple(found)
+        terms.append("states for the gyro bias over temperature")
+    terms += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
+    return tuple(terms)
 
 
 def _beyond_linear(
     attitude_sigma: float, columns: list[DeterministicError], sizes: Sequence[float], consider: Consider
 ) -> tuple[str, ...]:
     """Return the errors that are too large for the analysis, in words; ``sizes``: the largest error of a sensor by column, rad."""
-    found = []
+    terms = []
     if attitude_sigma > LARGEST_LINEAR:
-        found.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
+        terms.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
     if consider.scale_factor > LARGEST_LINEAR:
-        found.append(f"scale factor, 1σ {100.0 * consider.scale_factor:.3g} %")
+        terms.append(f"scale factor, 1σ {100.0 * consider.scale_factor:.3g} %")
     if consider.misalignment > LARGEST_LINEAR:
-        found.append(f"misalignment, 1σ {consider.misalignment / DEGREE:.3g}°")
+        terms.append(f"misalignment, 1σ {consider.misalignment / DEGREE:.3g}°")
     largest: dict[str, float] = {}
     for column, size in zip(columns, sizes, strict=True):
         name = column.name.partition(",")[0]  # the largest over the axes of a considered error
         largest[name] = max(largest.get(name, 0.0), size)
     large = (f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR)
-    return (*found, *large)
+    return (*terms, *large)
 
 
-def _attitude_beyond_linear(found: Analysis) -> list[str]:
+def _attitude_beyond_linear(analysis: Analysis) -> list[str]:
     """Return in words the largest attitude error, if it is too large for the analysis."""
-    errors = found.rms[:, :3].max(axis=1)
+    errors = analysis.rms[:, :3].max(axis=1)
     epoch = int(np.argmax(errors))
     if errors[epoch] <= LARGEST_LINEAR:
         return []
-    return [f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {found.time[epoch]:.6g} s"]
+    return [f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {analysis.time[epoch]:.6g} s"]

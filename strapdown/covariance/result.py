@@ -84,7 +84,7 @@ class Analysis(Listed):
             f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
             self.words,
             *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
-            *(f"Beyond linear: {one}; use a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
+            *(f"Beyond linear: {effect}; use a Monte Carlo (`strapdown montecarlo`)." for effect in self.beyond_linear),
         ]
         columns = (
             Column("source", "source"),

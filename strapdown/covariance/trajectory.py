@@ -104,7 +104,7 @@ def _exact(sensor: Any) -> Any:
 def _observed(scenario: Scenario) -> list[VectorMeasurements]:
     """Return the measurements of each sensor without noise, with the σ of the sensor."""
     start, end = scenario.edges[0], scenario.edges[-1]
-    found = []
+    observed = []
     for sensor in scenario.sensors:
         kinds = (
             vectors.VectorSensor,
@@ -120,13 +120,13 @@ def _observed(scenario: Scenario) -> list[VectorMeasurements]:
             )
         # The same seed for both, so that the same samples are lost.
         own, exact = (
-            one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name))
-            for one in (sensor, _exact(sensor))
+            source.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name))
+            for source in (sensor, _exact(sensor))
         )
-        found.append(
+        observed.append(
             dataclasses.replace(own, vector_b=exact.vector_b, attitude=exact.attitude, reference_f=exact.reference_f)
         )
-    return found
+    return observed
 
 
 def _length(series: VectorMeasurements) -> Array:
@@ -137,8 +137,8 @@ def _length(series: VectorMeasurements) -> Array:
 def unit_of(series: VectorMeasurements, sensor: Any) -> Array:
     """Return a unit of the sensor along the axes of the noise of each measurement (m,)."""
     sigma = 0.0 if series.attitude is not None else sensor.sigma
-    one = np.ones(len(series.time))
-    return np.divide(series.sigma / _length(series), sigma, out=one, where=sigma > 0.0)
+    unit = np.ones(len(series.time))
+    return np.divide(series.sigma / _length(series), sigma, out=unit, where=sigma > 0.0)
 
 
 def noise_of(series: VectorMeasurements, sensor: Any) -> Array:
@@ -171,12 +171,12 @@ def trajectory_of(scenario: Scenario, setup: FilterSetup, epochs: int) -> Trajec
     states = setup.states
     if states is not None and np.any(states.gyro_temperature_sigma):
         states = dataclasses.replace(states, gyro_temperature_sigma=0.0)
-    chosen = dataclasses.replace(setup, states=states)
-    problem = prepared(record, chosen, initial_state(setup, attitude[0]))
+    matched = dataclasses.replace(setup, states=states)
+    problem = prepared(record, matched, initial_state(setup, attitude[0]))
     problem = dataclasses.replace(problem, model=_model(problem))
     if problem.model.levers.any():
         # The angular acceleration is that of a run: how much it is smoothed depends on the gyro's noise.
-        motion = measured_motion(modelled_record(scenarios.simulate(scenario), chosen), chosen)
+        motion = measured_motion(modelled_record(scenarios.simulate(scenario), matched), matched)
         problem = dataclasses.replace(problem, motion=motion)
     every = steps // epochs * samples
     return Trajectory(

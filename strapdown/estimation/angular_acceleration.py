@@ -90,11 +90,11 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
         axis=1,
     )
     near = k[:, None] + np.arange(-1, 3)
-    found = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
+    turns_over = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
     lags = np.array([h[lag:] @ h[: len(h) - lag] for lag in range(4)]) / (h @ h)
     alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
     left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
-    return np.concatenate(found, axis=1), noises[best] * left[:, None] + bends[best]
+    return np.concatenate(turns_over, axis=1), noises[best] * left[:, None] + bends[best]
 
 
 def _products(series: Array) -> Array:
@@ -117,11 +117,11 @@ def _mean_squares(weights: Array, bending: Array, products: list[Array]) -> Arra
     """
     summed = np.cumsum(np.cumsum(weights, axis=1), axis=1)[:, :-2]
     inside, width = summed[_REACH], summed.shape[1]
-    found = np.empty(len(bending))
+    squares = np.empty(len(bending))
     for i, series in enumerate(bending):
         begin, end = summed[:_REACH] @ series[:width], summed[_REACH + 1 :] @ series[-width:]
-        found[i] = inside @ products[i] @ inside + begin @ begin + end @ end
-    return np.asarray(found / (bending.shape[1] + 2))
+        squares[i] = inside @ products[i] @ inside + begin @ begin + end @ end
+    return np.asarray(squares / (bending.shape[1] + 2))
 
 
 @functools.cache
@@ -148,6 +148,6 @@ def _lost(slope: Array, sharper: Array, own: Array, common: Array) -> Array:
     slopes (3,).
     """
     power = np.mean(slope**2, axis=0) - own
-    seen = power > own  # no factor for an axis that hardly rotates
+    rotates = power > own  # no factor for an axis that hardly rotates
     shared = np.mean(slope * sharper, axis=0) - common
-    return np.where(seen, np.maximum(shared / np.where(seen, power, 1.0), 1.0), 1.0)
+    return np.where(rotates, np.maximum(shared / np.where(rotates, power, 1.0), 1.0), 1.0)

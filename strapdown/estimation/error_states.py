@@ -211,7 +211,9 @@ def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
 
 def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     spread = np.broadcast_to(np.asarray(value, np.float64), (size,)).copy() if np.ndim(value) < 2 else value
-    return np.array([positive(f"{name}[{k}]", one, unit=unit) for k, one in enumerate(array(name, spread, (size,)))])
+    return np.array(
+        [positive(f"{name}[{k}]", sigma, unit=unit) for k, sigma in enumerate(array(name, spread, (size,)))]
+    )
 
 
 def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
@@ -237,8 +239,8 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
 
 def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
     """Return names and σ of those entries of a matrix that are states."""
-    chosen = np.flatnonzero(sigmas.ravel())
-    return tuple(ENTRIES[k] for k in chosen), np.asarray(sigmas.ravel()[chosen])
+    nonzero = np.flatnonzero(sigmas.ravel())
+    return tuple(ENTRIES[k] for k in nonzero), np.asarray(sigmas.ravel()[nonzero])
 
 
 def _units_of_entries(names: tuple[str, ...]) -> Array:
@@ -270,7 +272,11 @@ class GyroScale(ErrorStates):
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
         sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
         components, sigma = _entries(sigmas)
-        self._set(components=components, units=tuple("1" if one in AXES else "rad" for one in components), sigma=sigma)
+        self._set(
+            components=components,
+            units=tuple("1" if component in AXES else "rad" for component in components),
+            sigma=sigma,
+        )
 
     @property
     def gyro_scale(self) -> Array:
@@ -478,8 +484,8 @@ class LeverArm(ErrorStates):
         self._set(name=self.name or f"{self.sensor} lever arm")
         positive(f"{self.name}: strength", self.strength, unit="m/s²")
         spread = array(f"{self.name}: arm_sigma", np.broadcast_to(np.asarray(self.arm_sigma, np.float64), (3,)), (3,))
-        for k, one in enumerate(spread):
-            non_negative(f"{self.name}: arm_sigma[{k}]", one, unit="m")
+        for k, arm_sigma in enumerate(spread):
+            non_negative(f"{self.name}: arm_sigma[{k}]", arm_sigma, unit="m")
         if not spread.any():
             raise InputError(f"{self.name}: arm_sigma is 0; give a value above zero, or leave these error states out")
         used = np.flatnonzero(spread)
@@ -669,9 +675,9 @@ class BoundedVelocity(ErrorStates):
             for field_name, unit in three.items()
         ]
         velocity, acceleration, time = values
-        given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
+        values_given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
         if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: {given}: two must be above zero; the third follows from them")
+            raise InputError(f"{self.name}: {values_given}: two must be above zero; the third follows from them")
         slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
         if time == 0.0:
             rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
@@ -688,7 +694,7 @@ class BoundedVelocity(ErrorStates):
         elif velocity == 0.0:
             self._set(velocity_sigma=acceleration / ratio)
         elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {given} contradict each other at these times; give two of them")
+            raise InputError(f"{self.name}: {values_given} contradict each other at these times; give two of them")
 
     @property
     def _rates(self) -> Array:
@@ -726,9 +732,9 @@ class BoundedVelocity(ErrorStates):
     def density(self) -> Array:
         """``2 σ_v² (d₁ d₂ − d₀)`` of each drive, with dᵢ the coefficients of ``∏ (s + 1/τ) = s³ + d₂ s² + d₁ s + d₀``."""
         _, d2, d1, d0 = np.append(np.poly(-self._rates), np.zeros(3 - len(self._rates)))
-        one = np.zeros(len(self._rates))
-        one[-1] = 2.0 * self.velocity_sigma**2 * (d1 * d2 - d0)
-        return np.tile(one, 3)
+        spectral = np.zeros(len(self._rates))
+        spectral[-1] = 2.0 * self.velocity_sigma**2 * (d1 * d2 - d0)
+        return np.tile(spectral, 3)
 
     @property
     def feed(self) -> Array:

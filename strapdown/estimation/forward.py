@@ -527,7 +527,7 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
     the record may be the cause of the filter's error.
     """
     P = state.covariance[6:, 6:].copy()
-    minimum = np.concatenate([np.empty(0), *(np.asarray(one.sigma) ** 2 for one in error_states)])
+    minimum = np.concatenate([np.empty(0), *(np.asarray(block.sigma) ** 2 for block in error_states)])
     P[np.diag_indices(len(P))] = np.maximum(np.diag(P), minimum)
     return state.values, P
 
@@ -634,7 +634,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         if options.judged:
             outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0
             number, *ends = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
-            happened |= {(one.kind, one.sensor, one.start): one for one in judge.events(judged, *ends)}
+            happened |= {(event.kind, event.sensor, event.start): event for event in judge.events(judged, *ends)}
         else:
             number = compiled(walk, kernels)(*arguments, every, form, out_of_part)
         if number < 0:
@@ -773,12 +773,12 @@ def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[st
 
 def unit_sigmas(record: ImuRecord, model: Model, kept: Mapping[str, float]) -> dict[str, float]:
     """Return ``unit_sigma`` of a :class:`State` after a record: the given values, and for other sensors those of this record."""
-    found = {
+    sigmas = {
         series.sensor: float(np.sqrt(np.mean(level_sigma(series) ** 2)))
         for series in record.vectors
         if series.sensor in model.varying and len(series.time)
     }
-    return {**found, **kept}
+    return {**sigmas, **kept}
 
 
 def strength(series: VectorMeasurements) -> Array:

@@ -119,19 +119,21 @@ class LiveFilter:
         self._time = finite("time", time, unit="s")
         self.look_back = non_negative("look_back", look_back, unit="s")
         instance("sensors", sensors, Sequence, "give a list of sensors")
-        series = [template(one, self._time) for one in sensors]
-        for reserved in {one.sensor for one in series} & set(RESERVED):
+        series = [template(sensor, self._time) for sensor in sensors]
+        for reserved in {vectors.sensor for vectors in series} & set(RESERVED):
             raise InputError(f"a sensor is named {reserved!r}, as an argument of update; give it another name")
-        self._sensors = {one.sensor: one for one in series}
+        self._sensors = {vectors.sensor: vectors for vectors in series}
         if len(self._sensors) < len(series):
-            raise InputError(f"sensors has a name twice: {', '.join(one.sensor for one in series)}")
+            raise InputError(f"sensors has a name twice: {', '.join(vectors.sensor for vectors in series)}")
         # The kernels process each interval as a record; this one, without rotation, defines its arrays.
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
         refuse("a filter of single samples", record=self._problem.model.of_record)
         options = Options(gate=gate, robust=robust)
         self._judge, self._judged = Judge(self._problem, options), options.judged
-        self._writers = {one.sensor: (float(place), one.kind == "attitude") for place, one in enumerate(series)}
+        self._writers = {
+            vectors.sensor: (float(place), vectors.kind == "attitude") for place, vectors in enumerate(series)
+        }
         self._prepare(options)
         self._closed: tuple[Event, ...] = ()
         self._intervals: deque[_Interval] = deque()
@@ -200,14 +202,16 @@ class LiveFilter:
     def _live(self, dispatcher: Any, body: Any, out: Any, length: Array, results: int) -> kernel.Live:
         """Return the kernel's arrays."""
         sensors, most = list(self._sensors.values()), len(length)
-        declared = np.array([_row(one, place) for place, one in enumerate(sensors)]).reshape(-1, kernel.ROW)
-        series = np.array([[0, 0, 0, KIND_CODES[one.kind], 0, 1] for one in sensors], np.int64).reshape(-1, 6)
-        noisy = most if any(one.anisotropic for one in sensors) else 0
+        declared = np.array([_row(vectors, place) for place, vectors in enumerate(sensors)]).reshape(-1, kernel.ROW)
+        series = np.array([[0, 0, 0, KIND_CODES[vectors.kind], 0, 1] for vectors in sensors], np.int64).reshape(-1, 6)
+        noisy = most if any(vectors.anisotropic for vectors in sensors) else 0
         edges, increment = np.full(2, self._time), np.zeros(3)
         time, sensor, value = np.zeros(most), np.zeros(most, np.uint8), np.zeros(3 * most)
         sigma, noise, frame = np.ones(most), np.zeros((noisy, 6)), np.zeros((most, 9))
         place = np.arange(most, dtype=np.uint32)
-        measured = Measurements(*(read_only(one) for one in (time, place, sensor, value, sigma, noise, series, frame)))
+        measured = Measurements(
+            *(read_only(column) for column in (time, place, sensor, value, sigma, noise, series, frame))
+        )
         arguments = read_only(edges), read_only(increment.reshape(1, 3)), measured, 1 << 30, body, out
         return kernel.Live(
             address=address_of(dispatcher, arguments),
@@ -279,29 +283,29 @@ class LiveFilter:
             return
         call, turn, at = self._call, kernel.NO_TURN, kernel.FIRST
         name: str = "time"
-        given: Any = time
+        sample: Any = time
         try:
             call[0] = time
             if gyro is not None:
-                name, given, turn = "gyro", gyro, kernel.RATE
-                call[1], call[2], call[3] = given.tolist() if type(given) is np.ndarray else given
+                name, sample, turn = "gyro", gyro, kernel.RATE
+                call[1], call[2], call[3] = sample.tolist() if type(sample) is np.ndarray else sample
             if delta_theta is not None:
-                name, given, turn = "delta_theta", delta_theta, turn + kernel.INCREMENT
-                call[1], call[2], call[3] = given.tolist() if type(given) is np.ndarray else given
-            for name, given in measured.items():
+                name, sample, turn = "delta_theta", delta_theta, turn + kernel.INCREMENT
+                call[1], call[2], call[3] = sample.tolist() if type(sample) is np.ndarray else sample
+            for name, sample in measured.items():
                 call[at], whole = self._writers[name]
-                if given is None:
+                if sample is None:
                     call[at + 1] = math.nan
                 elif whole:
-                    call[at + 1], call[at + 2], call[at + 3], call[at + 4] = _quaternion(name, given)
+                    call[at + 1], call[at + 2], call[at + 3], call[at + 4] = _quaternion(name, sample)
                 else:
-                    call[at + 1], call[at + 2], call[at + 3] = given.tolist() if type(given) is np.ndarray else given
+                    call[at + 1], call[at + 2], call[at + 3] = sample.tolist() if type(sample) is np.ndarray else sample
                 at += kernel.STRIDE
         except KeyError:
             one_of("sensor", name, self._sensors)
         except (TypeError, ValueError, OverflowError):
             raise InputError(
-                f"{name} is {given!r}; give {'one number' if name == 'time' else 'three numbers'}"
+                f"{name} is {sample!r}; give {'one number' if name == 'time' else 'three numbers'}"
             ) from None
         if turn > kernel.INCREMENT:
             raise InputError("both gyro and delta_theta are given; give the rate or its integral")
@@ -343,23 +347,23 @@ class LiveFilter:
 
     def _refuse(self, code: int, gyro: tuple[str, Any], measured: dict[str, Any]) -> NoReturn:
         """Raise the error for a sample that the kernel refuses."""
-        time, now, (name, given) = self._call[0], self._time, gyro
+        time, now, (name, sample) = self._call[0], self._time, gyro
         if code == kernel.TOO_PRECISE:
             raise forward.TooPreciseError()
         if code in (kernel.INFINITE, kernel.NO_DIRECTION):
             name = list(self._sensors)[self._report[kernel.CULPRIT]]
-            given = measured[name]
+            sample = measured[name]
         raise InputError(
             {
                 kernel.NO_TIME: f"time is {time} s; give the time of the sample",
                 kernel.AHEAD: f"time is {time:.9g} s, after the filter's {now:.9g} s; give the gyro sample up to it",
                 kernel.BEHIND: f"time is {time:.9g} s, before the filter's {now:.9g} s; give samples in order",
                 kernel.NO_GYRO: f"{name} has a NaN; omit the sample; the next one then covers both intervals",
-                kernel.INFINITE_GYRO: f"{name} is {given}; give finite numbers",
-                kernel.LARGE_GYRO: f"{name} is {given}, too large for the rotation over {time - now:.6g} s from the last sample at "
+                kernel.INFINITE_GYRO: f"{name} is {sample}; give finite numbers",
+                kernel.LARGE_GYRO: f"{name} is {sample}, too large for the rotation over {time - now:.6g} s from the last sample at "
                 f"{now:.9g} s; check the unit, and that time is that of the initial state",
-                kernel.INFINITE: f"{name} is {given}; give finite numbers, or NaN for a missing measurement",
-                kernel.NO_DIRECTION: f"{name} is {given}, which has no direction; give NaN for a missing measurement",
+                kernel.INFINITE: f"{name} is {sample}; give finite numbers, or NaN for a missing measurement",
+                kernel.NO_DIRECTION: f"{name} is {sample}, which has no direction; give NaN for a missing measurement",
             }[code]
         )
 
@@ -391,27 +395,27 @@ class LiveFilter:
         self._intervals = deque(past[k] for k in range(first))
         self._state[:], self._closed = here.before, here.closed
         try:
-            for one in (here._replace(rows=rows), *(past[k] for k in range(first + 1, len(past)))):
-                self._repeat(one)
+            for interval in (here._replace(rows=rows), *(past[k] for k in range(first + 1, len(past)))):
+                self._repeat(interval)
         except InputError:
             self._intervals, self._closed, self._time, self._state[:] = past, closed, past[-1].end, state
             self._arrays.clock[0] = self._time
             raise
 
-    def _repeat(self, one: _Interval) -> None:
+    def _repeat(self, interval: _Interval) -> None:
         """Process an interval again."""
-        arrays, number = self._arrays, len(one.rows)
+        arrays, number = self._arrays, len(interval.rows)
         arrays.clock[0], self._call[0], arrays.increment[:], arrays.rows[:number] = (
-            one.start,
-            one.end,
-            one.increment,
-            one.rows,
+            interval.start,
+            interval.end,
+            interval.increment,
+            interval.rows,
         )
         code = self._step(self._kind, self._table, number, kernel.AGAIN)
         if code == kernel.TOO_PRECISE:
             raise forward.TooPreciseError()
-        self._time = one.end
-        self._keep(one.start, number)
+        self._time = interval.end
+        self._keep(interval.start, number)
         if code == kernel.REPORT:
             self._take_report()
 
@@ -462,8 +466,8 @@ class LiveFilter:
     @property
     def events(self) -> tuple[Event, ...]:
         """Recoveries and lock-outs up to now, in order of time."""
-        found = self._closed + self._reported(self._recoveries[:0], self._slots)
-        return tuple(sorted(found, key=lambda event: event.start))
+        events = self._closed + self._reported(self._recoveries[:0], self._slots)
+        return tuple(sorted(events, key=lambda event: event.start))
 
     @property
     def refused(self) -> dict[str, int]:
@@ -478,18 +482,18 @@ class LiveFilter:
     @property
     def innovations(self) -> dict[str, Innovations]:
         """Innovations of the measurements in the last gyro interval, by sensor."""
-        found, number = {}, self._report[kernel.LAST]
+        innovations, number = {}, self._report[kernel.LAST]
         for place, (name, sensor) in enumerate(self._sensors.items()):
             rows = np.flatnonzero(self._arrays.sensor[:number] == place)
             part = self._innovation[rows, : 2 * KINDS[sensor.kind]]
             if len(rows):
-                found[name] = Innovations(
+                innovations[name] = Innovations(
                     time=self._arrays.time[rows],
                     innovation=part[:, 0::2],
                     variance=part[:, 1::2],
                     weight=self._weight[rows] if self._judged else None,
                 )
-        return found
+        return innovations
 
     def state(self) -> State:
         """Return the present state, from which another filter, live or over a record, can continue.
@@ -547,8 +551,8 @@ def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMe
         r = sensor.reference_f
         # The σ of a heading is that across the direction, divided by the horizontal part.
         level = math.hypot(r[0], r[1]) if sensor.kind == "heading" else 1.0
-        given: dict[str, Any] = {"vector_b": r[None], "reference_f": r, "sigma": sensor.sigma / level}
-        return VectorMeasurements(sensor=sensor.name, kind=sensor.kind, time=np.array([time]), **given)
+        columns: dict[str, Any] = {"vector_b": r[None], "reference_f": r, "sigma": sensor.sigma / level}
+        return VectorMeasurements(sensor=sensor.name, kind=sensor.kind, time=np.array([time]), **columns)
     if not isinstance(sensor, VectorMeasurements):
         raise InputError(f"sensors has {sensor!r}; give vectors.VectorSensor, or the vectors of a record")
     if not len(sensor.time):

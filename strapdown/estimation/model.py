@@ -106,7 +106,7 @@ class Model:
 
 
 def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> Array:
-    parts = [array(f"{one.name}: {name}", getattr(one, name), (one.size, *shape)) for one in blocks]
+    parts = [array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)) for block in blocks]
     return np.concatenate([np.empty((0, *shape)), *parts])
 
 
@@ -160,7 +160,7 @@ def assemble(
             "effect on the gyro"
         )
     numbers = _Numbers(generic=generic)
-    groups = np.concatenate([np.full(one.size, generic * i) for i, one in enumerate(blocks)] or [np.empty(0)])
+    groups = np.concatenate([np.full(block.size, generic * i) for i, block in enumerate(blocks)] or [np.empty(0)])
     chains, last, sets = _chains(decay, density, feed, groups)
     gyro = tuple(
         GyroState(
@@ -274,10 +274,10 @@ def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
     if both.any():
         raise InputError(f"error state {int(np.argmax(both))} has a gyro_scale and a gyro_force; declare two states")
     known = [np.asarray(b.force_f, np.float64) for b in blocks if np.any(b.force_f)]
-    for one in known[1:]:
-        if not np.array_equal(one, known[0]):
+    for force in known[1:]:
+        if not np.array_equal(force, known[0]):
             raise InputError(
-                f"two error states give forces {known[0].tolist()} and {one.tolist()}; give both the same gravity_f"
+                f"two error states give forces {known[0].tolist()} and {force.tolist()}; give both the same gravity_f"
             )
     return array("force_f", known[0], (3,)) if known else np.zeros(3)
 
@@ -318,8 +318,8 @@ def _numbers(block: ErrorStates, effect: Effect) -> Array:
     ):
         value = getattr(effect, name)
         if value is not None:
-            given = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)
-            rows[:, place : place + given.shape[1]] = given
+            numbers = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)
+            rows[:, place : place + numbers.shape[1]] = numbers
     return rows
 
 
@@ -328,6 +328,6 @@ def aged_prior(
 ) -> tuple[Array, Array]:
     """Return values (m,) and covariance (m, m) of the error states after dt, s, without measurements."""
     transition, driven = np.zeros((2, len(values), len(values)))
-    for one, own in spans(error_states):
-        transition[own, own], driven[own, own] = one.transition(dt), one.process_noise(dt)
+    for block, own in spans(error_states):
+        transition[own, own], driven[own, own] = block.transition(dt), block.process_noise(dt)
     return transition @ values, transition @ covariance @ transition.T + driven

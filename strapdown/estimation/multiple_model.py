@@ -249,7 +249,7 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estima
     assert estimate.covariance is not None
     values, axes = np.linalg.eigh(estimate.covariance[-1, :3, :3])
     axis = quaternion.rotate(estimate.attitude[-1], axes[:, -1])
-    seen = (
+    measured = (
         f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
         f"the rotation about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
         f"{np.sqrt(values[-1]) / DEGREE:.3g}°"
@@ -259,10 +259,10 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estima
     turned = float(np.arcsin(min(apart, 1.0)))
     if turned < CONSTANT:
         return (
-            f"{seen}: all references lie along one line of the fixed frame, and the rotation about it cannot be observed, however the body "
-            "moves; add a sensor of another direction, or record until the reference has rotated"
+            f"{measured}: all references lie along one line of the fixed frame, and the rotation about it cannot be observed, however the "
+            "body moves; add a sensor of another direction, or record until the reference has rotated"
         )
     return (
-        f"{seen}: the references differ by up to {turned / DEGREE:.3g}°, which has not separated the hypotheses yet; record longer, or "
+        f"{measured}: the references differ by up to {turned / DEGREE:.3g}°, which has not separated the hypotheses yet; record longer, or "
         "add a sensor of another direction"
     )

@@ -125,8 +125,10 @@ class Observability(Listed):
         states = {"state": self.states, "unit": self.units, **sigmas}
         directions = {
             "singular_value": self.singular_values.tolist(),
-            "in_prior_sigma": [dict(zip(self.states, one, strict=True)) for one in self.directions.tolist()],
-            "one_sigma_left": [dict(zip(self.states, one, strict=True)) for one in self.left.tolist()],
+            "in_prior_sigma": [
+                dict(zip(self.states, direction, strict=True)) for direction in self.directions.tolist()
+            ],
+            "one_sigma_left": [dict(zip(self.states, sigmas, strict=True)) for sigmas in self.left.tolist()],
         }
         return {
             "rank": self.rank,

@@ -117,14 +117,14 @@ class Trajectory:
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:
     """Return the edges (n,) and the times of breaks."""
-    return np.unique(np.concatenate([time, *([one.start, one.since, one.end] for one in breaks)]))
+    return np.unique(np.concatenate([time, *([gap.start, gap.since, gap.end] for gap in breaks)]))
 
 
 def starts(time: Array, event_time: Array, segments: Array) -> np.ndarray:
     """Return the index of the segment that starts at each time; the last row of segments is the end state."""
-    found = np.empty(len(time), np.int64)
-    compiled(locate_edges)(read_only(time), event_time, segments, len(segments) - 1, found)
-    return found
+    first = np.empty(len(time), np.int64)
+    compiled(locate_edges)(read_only(time), event_time, segments, len(segments) - 1, first)
+    return first
 
 
 Rerun = tuple[Array, np.ndarray] | None
@@ -144,8 +144,8 @@ def trajectories(
     """
     stop = stops(time, breaks)
     place = np.searchsorted(stop, time)
-    own = np.searchsorted([one.since for one in breaks], time, side="right")
-    found = []
+    own = np.searchsorted([gap.since for gap in breaks], time, side="right")
+    parts = []
     for k in range(len(breaks) + 1):
         mine = np.flatnonzero(own == k)
         begin = int(np.searchsorted(stop, breaks[k - 1].end)) if k > 0 else 0
@@ -159,5 +159,5 @@ def trajectories(
             at[begin - len(early) + 1 : begin] = early[:-1]
             rows = np.concatenate([before[:-1], rows])
         last = int(np.searchsorted(stop, breaks[k].start)) if k < len(breaks) else len(stop) - 1
-        found.append(Trajectory(segments=rows, starts=at, edge=place[mine], last=last, row=mine))
-    return found
+        parts.append(Trajectory(segments=rows, starts=at, edge=place[mine], last=last, row=mine))
+    return parts

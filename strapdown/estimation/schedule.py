@@ -277,11 +277,11 @@ def innovations_by_sensor(
         mine = slice(events.bounds[i], events.bounds[i + 1])
         e, s = rows[mine, 0 : 2 * KINDS[kind] : 2], rows[mine, 1 : 2 * KINDS[kind] : 2]
         share = None if weight is None else weight[mine]
-        one = Innovations(time=events.series_time[i], innovation=e, variance=s, weight=share)
+        innovations = Innovations(time=events.series_time[i], innovation=e, variance=s, weight=share)
         shown = None if processed is None else processed[mine]
         if kind == "heading" and np.isnan(np.sum(e)):
             shown = ~np.isnan(e[:, 0]) if shown is None else shown & ~np.isnan(e[:, 0])
-        result[sensor] = one if shown is None else selected(one, shown)
+        result[sensor] = innovations if shown is None else selected(innovations, shown)
     return result
 
 
@@ -314,11 +314,11 @@ def joined(parts: Sequence[Estimate]) -> Estimate:
     innovations = {}
     for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
         own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
-        weights = [one.weight for one in own if one.weight is not None]
+        weights = [part.weight for part in own if part.weight is not None]
         innovations[sensor] = Innovations(
-            time=np.concatenate([one.time for one in own]),
-            innovation=np.concatenate([one.innovation for one in own]),
-            variance=np.concatenate([one.variance for one in own]),
+            time=np.concatenate([part.time for part in own]),
+            innovation=np.concatenate([part.innovation for part in own]),
+            variance=np.concatenate([part.variance for part in own]),
             weight=np.concatenate(weights) if len(weights) == len(own) else None,
         )
     blocks = {

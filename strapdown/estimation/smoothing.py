@@ -198,16 +198,16 @@ class _Smoother:
         time = self.problem.record.time
         stop = recovery_segments.stops(time, breaks)
         first = recovery_segments.starts(stop, self.problem.events.time, segments)
-        for one in recovery_segments.trajectories(time, breaks, first, segments, reruns):
+        for part in recovery_segments.trajectories(time, breaks, first, segments, reruns):
             written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
-            smoothed = one.edge <= one.last
+            smoothed = part.edge <= part.last
             if smoothed.any():
-                self.form.go_back(one.segments, one.starts[: one.last + 1], one.edge[0], written)
-            for edge in one.edge[~smoothed]:  # the filter's own
-                self.form.go_back(one.segments, one.starts[: edge + 1], edge, written)
+                self.form.go_back(part.segments, part.starts[: part.last + 1], part.edge[0], written)
+            for edge in part.edge[~smoothed]:  # the filter's own
+                self.form.go_back(part.segments, part.starts[: edge + 1], edge, written)
             for out, there in zip(outputs, written, strict=True):
                 if len(out):
-                    out[one.row] = there[one.edge]
+                    out[part.row] = there[part.edge]
 
     def _reruns(
         self, recovered: Sequence[Event], event_time: Array, segments: Array
@@ -228,16 +228,16 @@ class _Smoother:
                 state = self._part(recovery_segments.part(record, begin, event.end), state, self.options).end
                 memory = state.gate
                 begin = event.end
-            one = recovery_segments.break_of(event, memory, float(record.time[0]))
-            breaks.append(one)
-            if memory is None or one.since == one.end:
+            gap = recovery_segments.break_of(event, memory, float(record.time[0]))
+            breaks.append(gap)
+            if memory is None or gap.since == gap.end:
                 reruns.append(None)
                 continue
             bias, variance, counts = recovery_segments.restarted(gate, memory)
-            age = one.since - memory.start
+            age = gap.since - memory.start
             values, P = modelling.aged_prior(self.problem.error_states, memory.values, memory.covariance, age)
-            stop = recovery_segments.stops(record.time, [one])
-            lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, one.since)]
+            stop = recovery_segments.stops(record.time, [gap])
+            lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, gap.since)]
             whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
             whole[6:, 6:] = P
             fresh = State(
@@ -248,7 +248,7 @@ class _Smoother:
                 gate=replace(memory, counts=counts),
                 unit_sigma=state.unit_sigma,
             )
-            span = recovery_segments.part(record, one.since, one.end)
+            span = recovery_segments.part(record, gap.since, gap.end)
             problem = forward.prepared(span, self.problem.process_noise, fresh, self.problem.error_states)
             again = replace(self.options, every=len(span.time), gate=replace(gate, recovery=None))
             _, rows = recovery_segments.filtered_whole(problem, again)

@@ -193,9 +193,9 @@ ARGUMENTS: dict[str, tuple[type, str]] = {
 """Arguments of filters by name: class, and how to obtain one."""
 
 
-def check_arguments(**given: object) -> None:
+def check_arguments(**arguments: object) -> None:
     """Raise an error for arguments, given by name, of a wrong class; only a gate and robust updates may be None."""
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value is not None or name not in ("gate", "robust"):
             instance(name, value, *ARGUMENTS[name])
 
@@ -267,45 +267,45 @@ def _attitude_of_set(
     The error of the gyro up to the first of these measurements is common to all, and is added at the end; that from there on is a rotation
     of the later ones.
     """
-    body, fixed, sigmas, headings, chosen = [], [], [], [], []
+    body, fixed, sigmas, headings, used = [], [], [], [], []
     for series in record.vectors:
         content = series.vector_b if series.attitude is None else series.attitude
         inside = (series.time >= record.time[0]) & (series.time <= record.time[-1]) & np.isfinite(content).all(axis=1)
         if np.sum(inside) > k:
-            chosen.append(series.taken(np.flatnonzero(inside)[k : k + 1]))
+            used.append(series.taken(np.flatnonzero(inside)[k : k + 1]))
 
     def turn_variance(time: float) -> float:
         span = time - record.time[0]
         return float(process_noise.angle_random_walk**2 * span + (bias_sigma * span) ** 2)
 
-    common = turn_variance(min((one.time[0] for one in chosen), default=record.time[0]))
-    for one in chosen:
-        turn = _turn_until(record, bias, float(one.time[0]))
-        grown = turn_variance(one.time[0])
-        if one.attitude is not None:
-            attitude = quaternion.multiply(one.attitude[0], quaternion.conjugate(turn))
+    common = turn_variance(min((vectors.time[0] for vectors in used), default=record.time[0]))
+    for vectors in used:
+        turn = _turn_until(record, bias, float(vectors.time[0]))
+        grown = turn_variance(vectors.time[0])
+        if vectors.attitude is not None:
+            attitude = quaternion.multiply(vectors.attitude[0], quaternion.conjugate(turn))
             R = quaternion.to_matrix(turn)
-            return attitude, R @ one.covariances[0] @ R.T + grown * np.eye(3)
-        reference = one.references_f[0]
+            return attitude, R @ vectors.covariances[0] @ R.T + grown * np.eye(3)
+        reference = vectors.references_f[0]
         length = float(np.linalg.norm(reference))
-        body.append(quaternion.rotate(turn, one.vector_b[0] / np.linalg.norm(one.vector_b[0])))
+        body.append(quaternion.rotate(turn, vectors.vector_b[0] / np.linalg.norm(vectors.vector_b[0])))
         fixed.append(reference / length)
-        scale = length if one.kind == "vector" else 1.0
-        if one.kind == "heading":
-            headings.append((body.pop(), fixed.pop(), float(one.sigma[0]), grown - common))
+        scale = length if vectors.kind == "vector" else 1.0
+        if vectors.kind == "heading":
+            headings.append((body.pop(), fixed.pop(), float(vectors.sigma[0]), grown - common))
         else:
-            sigmas.append(float(np.hypot(one.sigma[0] / scale, np.sqrt(grown - common))))
+            sigmas.append(float(np.hypot(vectors.sigma[0] / scale, np.sqrt(grown - common))))
     if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
         # Together with the vertical, a heading is a direction: the horizontal part of its vector.
-        seen, reference, sigma, turned = headings[0]
-        level = seen - body[0] * (seen @ body[0])
+        direction, reference, sigma, turned = headings[0]
+        level = direction - body[0] * (direction @ body[0])
         horizontal = reference - fixed[0] * (reference @ fixed[0])
         attitude = wahba.solve(
             np.array([*body, level]), np.array([*fixed, horizontal]), np.array([*sigmas, sigma])
         ).attitude
         # A tilt changes the heading too, by the tangent of the dip, but the heading has no information about the tilt.
         R = quaternion.to_matrix(attitude)
-        row = np.array(heading_row(tuple(R.ravel()), tuple(seen)))
+        row = np.array(heading_row(tuple(R.ravel()), tuple(direction)))
         if not row.any():
             raise InputError("the vector that should give the heading is vertical")
         tilt = np.eye(3) - np.outer(R[2], R[2])

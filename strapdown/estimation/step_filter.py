@@ -164,11 +164,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _predict(self, increment: Array, left: float) -> None:
         """Propagate in sub-steps, each as long as the series and the decay rates of the states allow."""
         while left > 0.0:
-            squared = max(turn_squared(increment, left, one.bias) for one in self._running())
+            squared = max(turn_squared(increment, left, state.bias) for state in self._running())
             longest = float(min(step_within(squared, left), self._motion.limit))
             part = increment * (longest / left)
-            for one in self._running():
-                one._sub_step(part, longest)
+            for state in self._running():
+                state._sub_step(part, longest)
             increment, left = increment - part, left - longest if longest < left else 0.0
 
     def _sub_step(self, part: Array, dt: float) -> None:

@@ -27,7 +27,7 @@ BLOCKS = 1000
 
 def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
     """Return the position of the slopes among the error states; None if there are none."""
-    return next((own for one, own in spans(error_states) if isinstance(one, GyroTemperature)), None)
+    return next((own for block, own in spans(error_states) if isinstance(block, GyroTemperature)), None)
 
 
 def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
@@ -89,6 +89,6 @@ def at_mean(record: ImuRecord, mean: float, slope: Array) -> tuple[ImuRecord, Ar
 
 def at_edges(estimate: Estimate, own: slice, off: Array) -> Estimate:
     """Return an estimate of a segment with the bias at the temperatures of its edges, ``off`` K from the mean."""
-    values = np.concatenate([one.values for one in estimate.error_states.values()], axis=1)[:, own]
+    values = np.concatenate([block.values for block in estimate.error_states.values()], axis=1)[:, own]
     change = values * off[:, None]
     return replace(estimate, bias=estimate.bias + change)

@@ -20,7 +20,7 @@ def unpacked(typing: Any, kind: Any, table: Any) -> Any:
 
         def read(form: Any) -> Any:
             if isinstance(form, types.BaseTuple):
-                return target.make_tuple(builder, form, [read(one) for one in form])
+                return target.make_tuple(builder, form, [read(part) for part in form])
             integer = builder.load(builder.gep(integers, [ir.Constant(ir.IntType(64), next(place))]))
             if isinstance(form, types.Array):
                 element = target.get_data_type(form.dtype).as_pointer()
@@ -39,14 +39,14 @@ def call(typing: Any, address: Any, arguments: Any, like: Any) -> Any:
     """Call the machine code at an address."""
 
     def lower(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        convention, given = target.call_conv, list(arguments)
+        convention, parameters = target.call_conv, list(arguments)
         result = like if len(like) > 1 else like[0] if len(like) else types.none
-        kind = convention.get_function_type(result, given)
-        parts = cgutils.unpack_tuple(builder, values[1], len(given))
+        kind = convention.get_function_type(result, parameters)
+        parts = cgutils.unpack_tuple(builder, values[1], len(parameters))
         returned = cgutils.alloca_once(builder, kind.args[0].pointee)
         error = cgutils.alloca_once(builder, kind.args[1].pointee)
         function = builder.inttoptr(values[0], kind.as_pointer())
-        flat = convention._get_arg_packer(given).as_arguments(builder, parts)
+        flat = convention._get_arg_packer(parameters).as_arguments(builder, parts)
         builder.call(function, [returned, error, *flat])  # kernels raise nothing
         packer = target.data_model_manager[result]
         value = packer.from_return(builder, builder.load(returned))

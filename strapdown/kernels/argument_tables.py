@@ -18,8 +18,8 @@ def packed(value: Any) -> np.ndarray:
 
 def _integers(value: Any) -> Any:
     if isinstance(value, tuple):
-        for one in value:
-            yield from _integers(one)
+        for item in value:
+            yield from _integers(item)
     elif isinstance(value, np.ndarray):
         yield from (value.ctypes.data, *value.shape)
     else:

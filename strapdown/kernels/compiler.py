@@ -34,11 +34,11 @@ class _Lower(Lower):  # type: ignore[misc]
 
     def _apply(self, function: Any, signature: Any, variables: tuple[Any, ...]) -> Any:
         implementation = self.context.get_function(self.context.typing_context.resolve_value_type(function), signature)
-        given = [
-            self.context.cast(self.builder, self.loadvar(one.name), self.typeof(one.name), kind)
-            for one, kind in zip(variables, signature.args, strict=True)
+        operands = [
+            self.context.cast(self.builder, self.loadvar(variable.name), self.typeof(variable.name), kind)
+            for variable, kind in zip(variables, signature.args, strict=True)
         ]
-        return implementation(self.builder, given)
+        return implementation(self.builder, operands)
 
     def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
         signature = self.fndesc.calltypes[expr]
@@ -125,13 +125,13 @@ class _Target(CPUContext):  # type: ignore[misc]
     """The CPU target, with short code for elements and lengths of contiguous arrays. Indices must not be negative."""
 
     def get_function(self, function: Any, signature: Any, _firstcall: bool = True) -> Any:
-        given = signature.args
+        operands = signature.args
         builtin = getattr(function, "typing_key", None)
-        if given and isinstance(given[0], types.Array) and given[0].layout == "C":
+        if operands and isinstance(operands[0], types.Array) and operands[0].layout == "C":
             if builtin is len:
                 return lambda builder, values, *_: builder.extract_value(values[0], [SHAPE, 0])
-            if builtin in (operator.getitem, operator.setitem) and _counts(given[1], given[0].ndim):
-                return functools.partial(_element, self, given)
+            if builtin in (operator.getitem, operator.setitem) and _counts(operands[1], operands[0].ndim):
+                return functools.partial(_element, self, operands)
         return super().get_function(function, signature, _firstcall)
 
     def get_getattr(self, kind: Any, name: str) -> Any:
@@ -147,25 +147,25 @@ NITEMS, ITEMSIZE, DATA, SHAPE, STRIDES = range(2, 7)
 def _counts(index: types.Type, dimensions: int) -> bool:
     """Return whether an index is one integer for each dimension."""
     kinds = index.types if isinstance(index, types.BaseTuple) else (index,)
-    return len(kinds) == dimensions and all(isinstance(one, types.Integer) for one in kinds)
+    return len(kinds) == dimensions and all(isinstance(kind, types.Integer) for kind in kinds)
 
 
-def _element(target: Any, given: tuple[types.Type, ...], builder: Any, values: Any, *_: Any) -> Any:
+def _element(target: Any, operands: tuple[types.Type, ...], builder: Any, values: Any, *_: Any) -> Any:
     """Read an element of an array, or write it if a third value is given."""
     array, index = values[:2]
-    several = isinstance(given[1], types.BaseTuple)
+    several = isinstance(operands[1], types.BaseTuple)
     counts = cgutils.unpack_tuple(builder, index) if several else [index]
     place = None
-    for i, (count, kind) in enumerate(zip(counts, given[1].types if several else given[1:2], strict=True)):
+    for i, (count, kind) in enumerate(zip(counts, operands[1].types if several else operands[1:2], strict=True)):
         along = target.cast(builder, count, kind, types.intp)
         if isinstance(along, ir.Constant) and along.constant < 0:
             raise IndexError(f"an index of a kernel counts from the front; {along.constant} does not")
         place = builder.add(builder.mul(place, builder.extract_value(array, [SHAPE, i])), along) if i > 0 else along
     pointer = builder.gep(builder.extract_value(array, DATA), [place])
-    dtype, align = given[0].dtype, None if given[0].aligned else 1
+    dtype, align = operands[0].dtype, None if operands[0].aligned else 1
     if len(values) == 2:
         return target.unpack_value(builder, dtype, pointer, align)
-    return target.pack_value(builder, dtype, target.cast(builder, values[2], given[2], dtype), pointer, align)
+    return target.pack_value(builder, dtype, target.cast(builder, values[2], operands[2], dtype), pointer, align)
 
 
 class _Array(models.ArrayModel):  # type: ignore[misc]
@@ -225,8 +225,8 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
     def define_pipelines(self) -> list[PassManager]:
         """Return the only pipeline."""
         passes = PassManager("kernel")
-        for one in PASSES:
-            passes.add_pass(one, one.__name__)
+        for stage in PASSES:
+            passes.add_pass(stage, stage.__name__)
         passes.finalize()
         return [passes]
 

@@ -191,11 +191,11 @@ def predict(state, part, dt, body, out):
     running, lock_outs, recoveries, segments, lost = state
     form = body.form
     for i in range(running):
-        one = load(form, i)
+        trajectory = load(form, i)
         if i == 0 and segments < len(out.form.segments):
-            store_prediction(form, 0, one, segments, part, dt, out.form)
+            store_prediction(form, 0, trajectory, segments, part, dt, out.form)
             segments += 1
-        save(form, i, propagate(form, i, one, part, dt))
+        save(form, i, propagate(form, i, trajectory, part, dt))
     return running, lock_outs, recoveries, segments, lost
 
 

@@ -239,8 +239,8 @@ def digitize(edges, limit, step, resolution, carried, increments):
                 turn = unit * math.floor(turn / dt / unit + 0.5) * dt
             if q > 0.0:
                 turn += rest
-                given = q * math.floor(turn / q + 0.5)
-                rest = turn - given
-                turn = given
+                rounded = q * math.floor(turn / q + 0.5)
+                rest = turn - rounded
+                turn = rounded
             increments[k, axis] = turn
         carried[axis] = rest

@@ -130,21 +130,23 @@ class Found(NamedTuple):
     """Variance of the heading by constant iron, rad² (k,)."""
 
 
-def heading_steps(constants, steps, memory, found):
+def heading_steps(constants, steps, memory, out):
     """Process steps."""
     for k in range(len(steps.time)):
-        heading_step(constants, steps, memory, found, k)
+        heading_step(constants, steps, memory, out, k)
 
 
 def iron_steps(constants, field, frame, known, time, strength, memory, iron):
     """Write the iron (k, 3) of each row from fields (k, 3) in the frame fixed by the gyro, and attitudes (k, 4)."""
     for k in range(len(time)):
-        one = iron_step(constants, vector_at(field, k), quaternion_at(frame, k), known[k], time[k], strength, memory)
+        corrected = iron_step(
+            constants, vector_at(field, k), quaternion_at(frame, k), known[k], time[k], strength, memory
+        )
         memory.counted[1] += 1
-        store_row(iron, k, one)
+        store_row(iron, k, corrected)
 
 
-def heading_step(constants, steps, memory, found, k):
+def heading_step(constants, steps, memory, out, k):
     """Process step k."""
     known = steps.number[k] > 0.0
     if known:
@@ -153,18 +155,18 @@ def heading_step(constants, steps, memory, found, k):
     if steps.force_number[k] > 0.0:
         store_row(memory.held, 1, scale(1.0 / steps.force_number[k], vector_at(steps.force, k)))
         memory.counted[0] |= 2
-    found.sigma[k] = 0.0
-    store_row(found.iron, k, (0.0, 0.0, 0.0))
-    found.usual[k, 0], found.usual[k, 1] = 1.0, 0.0
+    out.sigma[k] = 0.0
+    store_row(out.iron, k, (0.0, 0.0, 0.0))
+    out.usual[k, 0], out.usual[k, 1] = 1.0, 0.0
     if memory.counted[0] == 3:
-        look_at_field(constants, steps, memory, found, k, known)
+        look_at_field(constants, steps, memory, out, k, known)
         memory.counted[1] += 1
-    across = constants.iron_sigma / math.cos(found.usual[k, 1])
-    found.variance[k] = across * across
-    close_heading(constants, steps, memory, found, k)
+    across = constants.iron_sigma / math.cos(out.usual[k, 1])
+    out.variance[k] = across * across
+    close_heading(constants, steps, memory, out, k)
 
 
-def look_at_field(constants, steps, memory, found, k, known):
+def look_at_field(constants, steps, memory, out, k, known):
     """Add the direction of the field of step k to the heading, with the information that its deviation leaves."""
     field = vector_at(memory.held, 0)
     frame = quaternion_at(steps.frame, k)
@@ -197,10 +199,10 @@ def look_at_field(constants, steps, memory, found, k, known):
     iron = scale(max(1.0 - left, 0.0), iron)
     if math.sqrt(dot(iron, iron)) < constants.negligible * strength:
         iron = (0.0, 0.0, 0.0)
-    store_row(found.iron, k, iron)
+    store_row(out.iron, k, iron)
     field = subtract(field, matrix_times_vector(R, iron))
     size = look(constants, memory, 2, field, up, forgotten)
-    found.usual[k, 0], found.usual[k, 1] = memory.median[4], memory.median[5]
+    out.usual[k, 0], out.usual[k, 1] = memory.median[4], memory.median[5]
     if known:
         steep = min(abs(memory.median[5]), constants.max_dip)
         relative = constants.field_disturbance / math.cos(steep)
@@ -213,15 +215,15 @@ def look_at_field(constants, steps, memory, found, k, known):
         memory.total[3] += information
 
 
-def close_heading(constants, steps, memory, found, k):
+def close_heading(constants, steps, memory, out, k):
     """Write the heading measurement, if its interval ends with step k."""
     before = memory.start[1]
     memory.start[1] = math.floor((steps.time[k] + constants.step - memory.start[0]) / constants.heading_interval - 1e-6)
     total = (memory.total[0], memory.total[1], memory.total[2])
     if memory.start[1] != before and memory.total[3] > 0.0:
         R = rotation_matrix(quaternion_at(steps.end, k))
-        store_row(found.direction, k, transpose_times_vector(R, scale(1.0 / math.sqrt(dot(total, total)), total)))
-        found.sigma[k] = 1.0 / math.sqrt(memory.total[3])
+        store_row(out.direction, k, transpose_times_vector(R, scale(1.0 / math.sqrt(dot(total, total)), total)))
+        out.sigma[k] = 1.0 / math.sqrt(memory.total[3])
     if memory.start[1] != before:
         for i in range(4):
             memory.total[i] = 0.0

@@ -72,7 +72,7 @@ def rotation_vector(q):
     squared = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     sine = square_root(squared)
     w = select(q[0] < 0.0, -q[0], q[0])
-    seen = squared > 1e-36  # below, the angle is twice the vector part, and the square may have underflowed
-    factor = select(seen, 2.0 * arctangent(sine, w) / select(seen, sine, 1.0), 2.0)
+    rotates = squared > 1e-36  # below, the angle is twice the vector part, and the square may have underflowed
+    factor = select(rotates, 2.0 * arctangent(sine, w) / select(rotates, sine, 1.0), 2.0)
     factor = select(q[0] < 0.0, -factor, factor)
     return (factor * q[1], factor * q[2], factor * q[3])

@@ -93,9 +93,9 @@ def _number_to_lanes(context: Any, builder: Any, source: Any, target: Any, value
 
 def _lanes_among(arguments: tuple[types.Type, ...]) -> Lanes | None:
     """Return the type of the lanes among the arguments; None if it is not unique, or if another argument is not a number."""
-    found = {a for a in arguments if isinstance(a, Lanes)}
+    kinds = {a for a in arguments if isinstance(a, Lanes)}
     others = [a for a in arguments if not isinstance(a, Lanes)]
-    return found.pop() if len(found) == 1 and all(map(_is_number, others)) else None
+    return kinds.pop() if len(kinds) == 1 and all(map(_is_number, others)) else None
 
 
 def _define(operation: Callable[..., Any], count: int, emit: Callable[..., Any], *, compares: bool = False) -> None:
@@ -190,12 +190,12 @@ def _instead_of(function: Callable[..., Any], typed: Callable[..., Any]) -> Call
     """
 
     def define(write: Callable[..., Any]) -> Callable[..., Any]:
-        def definition(typing: Any, *given: Any) -> Any:
+        def definition(typing: Any, *operands: Any) -> Any:
             def lower(target: Any, builder: Any, sig: Any, values: Any) -> Any:
                 result = write(target, builder, sig, *values)
                 return target.get_dummy_value() if result is None else result
 
-            return typed(*given), lower
+            return typed(*operands), lower
 
         first = inspect.Parameter("typing", inspect.Parameter.POSITIONAL_ONLY)
         parameters = [first, *inspect.signature(function).parameters.values()]

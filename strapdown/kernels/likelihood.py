@@ -209,12 +209,12 @@ def counted(e, span, measured, body, out):
         add_derivatives(room, number, body.free, body.step, out.score[span], out.information[span])
 
 
-def deviance_of(room, found, number, i):
+def deviance_of(room, place, number, i):
     """Return the NIS of a measurement and the determinant of its innovation covariance in lane i."""
     deviance, product = 0.0, 1.0
     for r in range(number):
-        e = room[found + 2 * WIDTH * r + i]
-        s = room[found + 2 * WIDTH * r + WIDTH + i]
+        e = room[place + 2 * WIDTH * r + i]
+        s = room[place + 2 * WIDTH * r + WIDTH + i]
         deviance += e * e / s
         product *= s
     return deviance, product

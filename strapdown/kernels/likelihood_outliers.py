@@ -63,10 +63,10 @@ def counted(e, span, measured, body, out):
     apply_step(x, P, work, like)
 
 
-def taken(P, work, rows, line, size, factor, room, found):
+def taken(P, work, rows, line, size, factor, room, place):
     """Update P and the step with the rows in the work space, their variances times a factor; return the sum of their ratios of noise.
 
-    Innovations and variances are written to ``room`` at ``found``.
+    Innovations and variances are written to ``room`` at ``place``.
     """
     like = broadcast(0.0)
     clear_step(work, like)
@@ -76,8 +76,8 @@ def taken(P, work, rows, line, size, factor, room, found):
         variance = factor * load(work, at + WIDTH)
         error, s = take_row(P, work, ROWS + r, load(work, at), variance, like)
         noise = noise + variance / s
-        store(room, found + 2 * WIDTH * r, error)
-        store(room, found + 2 * WIDTH * r + WIDTH, s)
+        store(room, place + 2 * WIDTH * r, error)
+        store(room, place + 2 * WIDTH * r + WIDTH, s)
     return noise
 
 

@@ -139,18 +139,18 @@ def take(kind, table, task):
 
 def refusal(imu, task):
     """Return the reason to refuse a sample, or 0."""
-    given = imu.filter.call
-    if not abs(given[TIME]) < math.inf:
+    call = imu.filter.call
+    if not abs(call[TIME]) < math.inf:
         return NO_TIME
-    if task != FIRST_SAMPLE and given[TIME] <= imu.time[1]:
+    if task != FIRST_SAMPLE and call[TIME] <= imu.time[1]:
         return BEHIND
     for i in range(3):
-        if math.isnan(given[GYRO + i]):
+        if math.isnan(call[GYRO + i]):
             return NO_GYRO
         if (
-            abs(given[GYRO + i]) > imu.largest_rate
-            or abs(given[FIRST + i]) == math.inf
-            or abs(given[FIELD + i]) == math.inf
+            abs(call[GYRO + i]) > imu.largest_rate
+            or abs(call[FIRST + i]) == math.inf
+            or abs(call[FIELD + i]) == math.inf
         ):
             return INFINITE
     if task != FIRST_SAMPLE and imu.edge[1] + 1 >= len(imu.force):

@@ -52,7 +52,7 @@ def _is_kernel(value: object) -> bool:
 
 def _names(code: CodeType) -> tuple[str, ...]:
     """Return the global names in a function's code and in its generator expressions."""
-    inner = (_names(one) for one in code.co_consts if isinstance(one, CodeType))
+    inner = (_names(code_object) for code_object in code.co_consts if isinstance(code_object, CodeType))
     return sum(inner, code.co_names)
 
 
@@ -69,9 +69,9 @@ def _depends_on_parts(function: FunctionType) -> bool:
     return any(name in _open(function) or _depends_on_parts(value) for name, value in named.items())
 
 
-def _open(one: FunctionType | ModuleType) -> tuple[str, ...]:
+def _open(scope: FunctionType | ModuleType) -> tuple[str, ...]:
     """Return the names that a module, or the module of a function, leaves open."""
-    names = one.__globals__ if isinstance(one, FunctionType) else vars(one)
+    names = scope.__globals__ if isinstance(scope, FunctionType) else vars(scope)
     return (*names.get("OPEN", ()), *names.get("REPLACEABLE", ()))
 
 
@@ -80,9 +80,9 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
     if name not in _open(function):
         return value
     for module in parts:
-        found = getattr(module, name, None)
-        if isinstance(found, FunctionType) and name not in _open(module):
-            return found
+        definition = getattr(module, name, None)
+        if isinstance(definition, FunctionType) and name not in _open(module):
+            return definition
     if name in function.__globals__.get("REPLACEABLE", ()):
         return value
     for module in parts:  # the default of another module
@@ -97,21 +97,21 @@ def _checked(
     function: FunctionType, parts: tuple[ModuleType, ...]
 ) -> dict[str, tuple[FunctionType, tuple[ModuleType, ...]]]:
     """Return definition and parts of each kernel that a function refers to, by name; invalid references are refused, recursively."""
-    found = {}
+    checked = {}
     for name in _names(function.__code__):
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
             raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
         if isinstance(value, FunctionType) and _is_kernel(value):
             value = _defined(name, value, function, parts)
-            found[name] = (value, parts if _depends_on_parts(value) else ())
-            _checked(*found[name])
-    return found
+            checked[name] = (value, parts if _depends_on_parts(value) else ())
+            _checked(*checked[name])
+    return checked
 
 
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
-    bound: dict[str, Any] = {name: helper(*one) for name, one in _checked(function, parts).items()}
+    bound: dict[str, Any] = {name: helper(*checked) for name, checked in _checked(function, parts).items()}
     others = (name for name in _names(function.__code__) if name in function.__globals__ and name not in bound)
     bound |= {"__name__": function.__module__, **{name: function.__globals__[name] for name in others}}
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
@@ -133,7 +133,7 @@ def _without_literals(dispatcher: Any) -> Any:
 
     resolve = dispatcher.get_call_template
     dispatcher.get_call_template = lambda args, kws: resolve(
-        tuple(types.unliteral(one) for one in args), {name: types.unliteral(one) for name, one in kws.items()}
+        tuple(types.unliteral(kind) for kind in args), {name: types.unliteral(kind) for name, kind in kws.items()}
     )
     return dispatcher
 
@@ -179,10 +179,10 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     class Cache(KernelCache):
         def load_overload(self, signature: Any, target: Any) -> Any:
-            found = super().load_overload(signature, target)
-            if found is None:
+            entry = super().load_overload(signature, target)
+            if entry is None:
                 dispatcher._compiler.py_func = twin()
-            return found
+            return entry
 
     options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
     dispatcher = numba.njit(**options)(function)

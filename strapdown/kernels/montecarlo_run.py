@@ -382,11 +382,11 @@ def begin(body):
     start_gyro(body.gyro, draws, like)
     x = drawn_triple(draws.ahead, START, 0, like)
     y = drawn_triple(draws.ahead, START, 3, like)
-    given = start.error
-    error = combine(given[0], x, 1.0, (given[2], given[3], given[4]))
+    errors = start.error
+    error = combine(errors[0], x, 1.0, (errors[2], errors[3], errors[4]))
     attitude = (start.attitude[0], start.attitude[1], start.attitude[2], start.attitude[3])
     q = unit(quaternion_multiply(attitude, exponential((-error[0], -error[1], -error[2]))))
-    offset = combine(given[1], y, 1.0, (given[5], given[6], given[7]))
+    offset = combine(errors[1], y, 1.0, (errors[5], errors[6], errors[7]))
     b = subtract(bias_now(body.gyro, 0, draws, like), offset)
     return start_filters(q, b, body, like)
 

@@ -35,14 +35,14 @@ def halves(samples, sums, number):
             if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
                 count += 1
         number[k] = count
-        seen = 0
+        count_below = 0
         for half in range(2):
             for c in range(3):
                 sums[k, half, c] = 0.0
         for i in range(samples.shape[1]):
             if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
-                seen += 1
-                half = 0 if 2 * seen <= count + 1 else 1
+                count_below += 1
+                half = 0 if 2 * count_below <= count + 1 else 1
                 for c in range(3):
                     sums[k, half, c] += samples[k, i, c]
 

@@ -150,13 +150,13 @@ def prepare_turns(segments, start, work, group):
     r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
     squared = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
     # Without an update the bias is unchanged to the bit, the attitude to rounding.
-    seen = select(dot(step_b, step_b) > 0.0, broadcast(1.0), squared) > _NOTHING
-    if any_lane(seen):
+    rotates = select(dot(step_b, step_b) > 0.0, broadcast(1.0), squared) > _NOTHING
+    if any_lane(rotates):
         turn = (-r[3], *r, *step_b, r[2], -r[1], r[0], r[3], -r[2])
         store_several(work, COLUMNS + TURN * w, turn)
         near = select(r[0] > 0.0, squared, broadcast(1.0)) < 0.25 * SHORT
         how = select(near, broadcast(1.0), broadcast(2.0))
-        store(work, group + MOVED, select(seen, how, broadcast(0.0)))
+        store(work, group + MOVED, select(rotates, how, broadcast(0.0)))
     else:
         store(work, group + MOVED, broadcast(0.0))
 
@@ -261,9 +261,9 @@ def carry_error(work, group, errors, i):
             work[s], work[s + 1], work[s + 2] = a
             factor = 1.0
         work[FACTOR + i] = factor
-        seen = work[s] * c0 + work[s + 1] * c1 + work[s + 2] * c2
+        moved = work[s] * c0 + work[s + 1] * c1 + work[s + 2] * c2
         stepped = work[d + 3] * c3 + work[d + 4] * c4 + work[d + 5] * c5
-        store(work, e - w, factor * seen + stepped)
+        store(work, e - w, factor * moved + stepped)
     else:
         store(work, e - w, times_columns(work, (e, e + 1, e + 2, e + 3, e + 4, e + 5), (c0, c1, c2, c3, c4, c5)))
 
@@ -271,13 +271,13 @@ def carry_error(work, group, errors, i):
 def fold_jacobians(work, group, errors):
     """Write the first three columns of G J for a group, J = J_r(a)⁻¹ J_r(ε) with ε the error at the end of each segment."""
     w = WIDTH
-    seen = load(work, group + MOVED) > 0.5
-    if any_lane(seen):
+    rotates = load(work, group + MOVED) > 0.5
+    if any_lane(rotates):
         e0, e1, e2, _ = load_quadruples(work, errors + w, w)
         a0, a1, a2, _ = load_quadruples(work, SEEN, w)
         a0, a1, a2 = scale(load(work, FACTOR), (a0, a1, a2))
         e = (e0, e1, e2)
-        a = (select(seen, a0, e0), select(seen, a1, e1), select(seen, a2, e2))
+        a = (select(rotates, a0, e0), select(rotates, a1, e1), select(rotates, a2, e2))
         if any_lane(dot(e, e) > SQUARED_RANGE) or any_lane(dot(a, a) > SQUARED_RANGE):
             for i in range(WIDTH):
                 s = errors + w + w * i

@@ -52,22 +52,22 @@ class Trace:
         finally:
             Trace.now = before
 
-    def signature(self, function: Any, given: tuple[Any, ...]) -> tuple[Any, Any]:
+    def signature(self, function: Any, operands: tuple[Any, ...]) -> tuple[Any, Any]:
         """Return numba's type of a function and its signature for arguments of these types."""
         kind = self.typing._lookup_global(function) or self.typing.resolve_value_type(function)
-        key = (function, *map(id, given))  # numba has one object for each type; its hash runs in Python
+        key = (function, *map(id, operands))  # numba has one object for each type; its hash runs in Python
         known = self._signatures.get(key)
         if known is None or known[0] != kind:
-            known = self._signatures[key] = (kind, self.typing.resolve_function_type(kind, given, {}), given)
+            known = self._signatures[key] = (kind, self.typing.resolve_function_type(kind, operands, {}), operands)
         return known[:2]
 
     def apply(self, function: Any, *arguments: Any) -> Any:
         """Return the result of a function known to numba for symbols and numbers."""
-        given = tuple(map(type_of, arguments))
-        kind, signature = self.signature(function, given)
+        operands = tuple(map(type_of, arguments))
+        kind, signature = self.signature(function, operands)
         if self.builder is None:
             return symbols(signature.return_type)
-        key = (function, *map(id, given))
+        key = (function, *map(id, operands))
         if key not in self._implementations:
             self._implementations[key] = self.target.get_function(kind, signature)
         values = [self.value(a, t) for a, t in zip(arguments, signature.args, strict=True)]
@@ -96,7 +96,7 @@ def type_of(value: Any) -> Any:
         return value.type
     if isinstance(value, tuple):
         pytype = type(value) if hasattr(value, "_fields") else None
-        return types.BaseTuple.from_types([type_of(one) for one in value], pytype)
+        return types.BaseTuple.from_types([type_of(item) for item in value], pytype)
     if not isinstance(value, bool | int | float | np.number | type(None)):
         raise NotAFormula
     return types.float64 if isinstance(value, float) else numba.typeof(value)
@@ -187,8 +187,8 @@ class Formula:
         if self.pack is not None and all(type_of(x) == types.float64 for a in arguments for x in a):
             if trace.builder is None:
                 return tuple(Symbol(types.float64, None) for _ in range(9))
-            given = [[trace.value(x, types.float64) for x in a] for a in arguments]
-            return tuple(Symbol(types.float64, value) for value in self.pack(trace.builder, *given))
+            operands = [[trace.value(x, types.float64) for x in a] for a in arguments]
+            return tuple(Symbol(types.float64, value) for value in self.pack(trace.builder, *operands))
         key = _shape(arguments)
         if trace.builder is None and key not in self.known and not self.never:
             try:
@@ -205,7 +205,7 @@ class Formula:
 
 def _short_range(*bounds: Any) -> range:
     """Return a range to unroll; if it is longer, or not a constant, numba compiles a loop."""
-    if any(isinstance(one, Symbol) for one in bounds) or len(range(*bounds)) > LONGEST:
+    if any(isinstance(bound, Symbol) for bound in bounds) or len(range(*bounds)) > LONGEST:
         raise NotAFormula
     return range(*bounds)
 
@@ -239,25 +239,25 @@ def traced(twin: FunctionType, plain: Any, *, called: bool) -> Any:
         plain.formula = formula
         return plain
 
-    def define(typing: Any, *given: Any, **named: Any) -> Any:
-        given = formula.signature.bind(*given, **named).args
+    def define(typing: Any, *operands: Any, **named: Any) -> Any:
+        operands = formula.signature.bind(*operands, **named).args
         finding = Trace(typing)
         try:
             with finding.running():
-                result = type_of(formula(*map(symbols, given)))
+                result = type_of(formula(*map(symbols, operands)))
         except NotAFormula:
-            kind, wanted = finding.signature(plain, given)
+            kind, wanted = finding.signature(plain, operands)
             return wanted, lambda target, builder, _, values: target.get_function(kind, wanted)(builder, values)
 
         def write(target: Any, builder: Any, signature: Any, values: Any) -> Any:
             writing = Trace(typing, target, builder)
             with writing.running():
-                return writing.value(formula(*map(symbols, given, values)), signature.return_type)
+                return writing.value(formula(*map(symbols, operands, values)), signature.return_type)
 
-        return result(*given), write
+        return result(*operands), write
 
     parameters = [inspect.Parameter("typing", inspect.Parameter.POSITIONAL_ONLY)]
     define.__signature__ = inspect.Signature([*parameters, *formula.signature.parameters.values()])  # type: ignore[attr-defined]
-    one = intrinsic(define)
-    one.formula = formula
-    return one
+    routine = intrinsic(define)
+    routine.formula = formula
+    return routine

@@ -253,23 +253,23 @@ def run(
         raise InputError(
             f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
-    chosen = choose(plan, machine)
+    engine = choose(plan, machine)
     with locked(target):
         held = _stored(target) if resume and target.exists() else None
         if held is None:
-            size = MACHINES[chosen.machine].CHUNK if chunk is None else count("chunk", chunk)
+            size = MACHINES[engine.machine].CHUNK if chunk is None else count("chunk", chunk)
             state, before = _Progress(None, {}, size), 0.0
         else:
             stored, state = held
             size, before = stored.chunk, stored.seconds
-            _need_same(target, stored, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
+            _need_same(target, stored, plan, engine.machine, size if chunk is None else count("chunk", chunk), runs)
         begun = time.perf_counter()
 
         def write() -> Campaign:
             now = Campaign(
                 plan=plan,
-                machine=chosen.machine,
-                reason=chosen.reason,
+                machine=engine.machine,
+                reason=engine.reason,
                 chunk=size,
                 runs=runs,
                 statistics=None if state.statistics is None else replace(state.statistics, plan=plan),
@@ -279,7 +279,7 @@ def run(
             _write(target, now, state, table)
             return now
 
-        work = Work(plans=(plan,), machine=chosen.machine)
+        work = Work(plans=(plan,), machine=engine.machine)
         return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
 
 
@@ -314,16 +314,16 @@ def _compute(
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
     """Raise if the file is of another plan, naming the first difference."""
-    given = _flat(plan.to_table()) | {"machine": machine, "chunk": chunk, **identity()._asdict()}
+    wanted = _flat(plan.to_table()) | {"machine": machine, "chunk": chunk, **identity()._asdict()}
     there = _flat(held.plan.to_table()) | {
         name: getattr(held, name) for name in ("machine", "chunk", *Identity._fields)
     }
-    for name in sorted(given.keys() | there.keys()):
-        if given.get(name) != there.get(name):
+    for name in sorted(wanted.keys() | there.keys()):
+        if wanted.get(name) != there.get(name):
             of_code = name in ("version", "sources")
             remedy = "continue it with the strapdown that began it" if of_code else "give the value in the file"
             raise InputError(
-                f"{target} is of another campaign; {name} is {there.get(name) or 'not given'} there and {given.get(name) or 'not given'} "
+                f"{target} is of another campaign; {name} is {there.get(name) or 'not given'} there and {wanted.get(name) or 'not given'} "
                 f"here; {remedy}, or choose another file"
             )
     finished = 0 if held.statistics is None else held.statistics.runs
@@ -402,8 +402,8 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
         "first_nees_exponent": NEES_EXPONENT,
     }
     set_attributes(group, attributes)
-    for name, one in _ARRAYS.items():
-        put(group, name, getattr(statistics, name), one.unit, one.meaning)
+    for name, dataset in _ARRAYS.items():
+        put(group, name, getattr(statistics, name), dataset.unit, dataset.meaning)
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:

@@ -182,8 +182,8 @@ def _result(distributed: Any, client: Any, future: Any, chunk: tuple[int, int]) 
             f"a worker computes on {there.arithmetic}, this process on {here.arithmetic}, which round differently; use workers "
             "of one kind and start the campaign on such a machine"
         )
-    found: Parts = parts
-    return found
+    result: Parts = parts
+    return result
 
 
 def _chunk(payload: bytes, first_run: int, runs: int, wanted: Identity) -> tuple[Identity, Parts]:

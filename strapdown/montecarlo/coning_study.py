@@ -108,7 +108,7 @@ class ConingParameters:
             )
         count("runs", self.runs)
         count("seed", self.seed, minimum=0)
-        names = [one.name for one in self.algorithms]
+        names = [algorithm.name for algorithm in self.algorithms]
         if len(set(names)) < len(names):
             raise InputError(
                 f"own has an algorithm whose name is already one of {', '.join(names)}; give it another name"
@@ -122,7 +122,7 @@ class ConingParameters:
     @property
     def step_multiple(self) -> int:
         """Least common multiple of :data:`STEP_MULTIPLE` and the steps of ``own``."""
-        return math.lcm(STEP_MULTIPLE, *(one.samples for one in self.own))
+        return math.lcm(STEP_MULTIPLE, *(algorithm.samples for algorithm in self.own))
 
     @property
     def samples(self) -> int:
@@ -181,7 +181,7 @@ class FilterOutcome:
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
         low, high = self.statistics.nis_bounds()
-        nees = all(one.consistent for one in self.verdicts.values())
+        nees = all(verdict.consistent for verdict in self.verdicts.values())
         return nees and low <= self.statistics.mean_nis <= high
 
     def summary(self) -> dict[str, Any]:
@@ -267,7 +267,7 @@ class ConingStudy:
                 for drift in self.drifts
             ],
             "filter": [outcome.summary() for outcome in self.outcomes],
-            **({"own": [own_summary(one) for one in p.own]} if p.own else {}),
+            **({"own": [own_summary(algorithm) for algorithm in p.own]} if p.own else {}),
         }
 
 
@@ -334,10 +334,12 @@ def own_table(own: Sequence[coning.Algorithm]) -> Table:
         Column("C for the same increments", "best_drift_constant"),
     )
     rows = []
-    for one in own:
-        constant = one.drift_constant
+    for algorithm in own:
+        constant = algorithm.drift_constant
         exact = f" = {constant}" if constant.denominator < SHOWN_DENOMINATOR else ""
-        rows.append({**own_summary(one), "samples": one.samples, "drift_constant": f"{float(constant):.4g}{exact}"})
+        rows.append(
+            {**own_summary(algorithm), "samples": algorithm.samples, "drift_constant": f"{float(constant):.4g}{exact}"}
+        )
     title = "Your own algorithms: drift under small coning is −C β² ω (ωh)^n, derived from the coefficients"
     return _table(title, columns, rows, name="own")
 
@@ -349,7 +351,7 @@ SHOWN_DENOMINATOR = 10**7
 def _table(
     title: str, columns: Sequence[Column], rows: Sequence[Any], notes: Sequence[str] = (), *, name: str
 ) -> Table:
-    return Table(title, columns, [[row[one.key] for one in columns] for row in rows], notes, name=name)
+    return Table(title, columns, [[row[column.key] for column in columns] for row in rows], notes, name=name)
 
 
 def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:
@@ -394,8 +396,8 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> 
     step = algorithm.samples / rate
     longest = int(min(MAX_STEPS, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else MAX_STEPS
     cycles = np.arange(longest // 2, longest + 1) * (step * motion.frequency)
-    chosen = longest // 2 + int(np.argmin(np.abs(cycles - np.round(cycles))))
-    edges = np.arange(chosen * algorithm.samples + 1) / rate
+    steps = longest // 2 + int(np.argmin(np.abs(cycles - np.round(cycles))))
+    edges = np.arange(steps * algorithm.samples + 1) / rate
     estimate = coning.integrate(motion.increments(edges), algorithm, motion.attitude(0.0))[-1]
     error_f = quaternion.log(quaternion.multiply(estimate, quaternion.conjugate(motion.attitude(edges[-1]))))
     return float(error_f[2] / edges[-1])

@@ -122,19 +122,19 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     Replay
         Record, initial state and estimate.
     """
-    found: Replay = MACHINES[choose(plan, machine).machine].replay(plan, count("run", run, minimum=0))
+    replayed: Replay = MACHINES[choose(plan, machine).machine].replay(plan, count("run", run, minimum=0))
     spec = dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
     if spec is not plan.scenario.gyro:  # dispersed, so no longer a preset
         of_this_run = replace(plan.scenario, gyro=spec, gyro_preset="")
     origin = Origin(gyro=spec, scenario=of_this_run, seed=plan.seed, run=run)
-    record, estimate = found.record, found.estimate
+    record, estimate = replayed.record, replayed.estimate
     assert record.truth is not None
     # If a filter step combines several samples, the record is at the samples or at the steps, depending on the machine.
     truth = record.truth.taken(np.searchsorted(record.time, estimate.time - 1e-9))
     details = {"machine": choose(plan, machine).machine, "dispersions": json.dumps(plan.to_table()["dispersions"])}
     estimate = replace(estimate, setup=plan.setup, origin=origin, truth=truth, details=details)
-    return replace(found, record=replace(record, origin=origin), estimate=estimate)
+    return replace(replayed, record=replace(record, origin=origin), estimate=estimate)
 
 
 @dataclass(frozen=True)
@@ -292,9 +292,9 @@ def run_plan(
     Statistics
         Sums over all runs, merged in the order of the chunks.
     """
-    chosen = choose(plan, machine).machine
-    size = MACHINES[chosen].CHUNK if chunk is None else count("chunk", chunk)
-    work = Work(plans=(plan,), machine=chosen)
+    name = choose(plan, machine).machine
+    size = MACHINES[name].CHUNK if chunk is None else count("chunk", chunk)
+    work = Work(plans=(plan,), machine=name)
     return _run(work, count("runs", runs), size, in_threads(threads) if workers is None else workers, progress)[0]
 
 
@@ -339,7 +339,7 @@ def run(
         One per setup.
     """
     count("runs", runs)
-    plans = tuple(Plan(scenario=scenario, setup=one, seed=seed, **options) for one in setups)
+    plans = tuple(Plan(scenario=scenario, setup=setup, seed=seed, **options) for setup in setups)
     names = {choose(plan, machine).machine for plan in plans}
     work = Work(plans=plans, machine=names.pop() if len(names) == 1 else scalar.NAME)
     size = MACHINES[work.machine].CHUNK if chunk is None else count("chunk", chunk)

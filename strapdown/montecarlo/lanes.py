@@ -181,7 +181,7 @@ def _prepare(plan: Plan) -> _Prepared:
     quiet = simulate(replace(scenario, gyro=_quiet(scenario.gyro), sensors=()), plan.seed, 0)
     # From one run: times, kinds, references and nominal σ are common to all runs.
     ends = scenario.motion, scenario.edges[0], scenario.edges[-1]
-    series = tuple(one.observe(*ends, generator(plan.seed, 0, one.name)) for one in scenario.sensors)
+    series = tuple(sensor.observe(*ends, generator(plan.seed, 0, sensor.name)) for sensor in scenario.sensors)
     quiet = replace(quiet, vectors=series)
     record = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
     assert record.truth is not None
@@ -367,7 +367,7 @@ def _event_terms(
 def _true_turning(plan: Plan, time: Array) -> Array:
     """Return ``[ẇ] + [w]²`` by rows (m, 9) at these times; no rows if the runs do not differ in lever arms."""
     motion = plan.scenario.motion
-    if not plan.individuals or not any(np.any(getattr(one, "lever_arm_b", 0.0)) for one in plan.scenario.sensors):
+    if not plan.individuals or not any(np.any(getattr(sensor, "lever_arm_b", 0.0)) for sensor in plan.scenario.sensors):
         return np.empty((0, 9))
     rate, arms = np.cross(motion.body_rate(time)[:, None], np.eye(3)), np.eye(3)
     columns = np.cross(motion.body_angular_acceleration(time)[:, None], arms)
@@ -436,7 +436,7 @@ class _Group:
         """Return the measured motion of a lever arm at the events (events, 9, runs), flat, from the increments drawn."""
         problem = self.prepared.problem
         runs = np.moveaxis(self.draws.increments.reshape(-1, 3, WIDTH), -1, 0)
-        records = [replace(problem.record, increments=np.ascontiguousarray(one)) for one in runs]
+        records = [replace(problem.record, increments=np.ascontiguousarray(increments)) for increments in runs]
         turns = [forward.turns(replace(problem, record=record)) for record in records]
         return np.stack(turns, axis=-1).reshape(-1)
 

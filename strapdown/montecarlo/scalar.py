@@ -45,10 +45,10 @@ def start(
     record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
 ) -> estimation.State:
     """Return the initial state of one run: the truth with errors drawn from the dispersions, by default from the filter's prior."""
-    given = Dispersions() if dispersions is None else dispersions
-    fixed = given.attitude_error, given.bias_error
+    errors = Dispersions() if dispersions is None else dispersions
+    fixed = errors.attitude_error, errors.bias_error
     return setup.drawn_state(
-        filter_setup, record, seed, run, sigmas=initial_sigmas(given, filter_setup), fixed_errors=fixed
+        filter_setup, record, seed, run, sigmas=initial_sigmas(errors, filter_setup), fixed_errors=fixed
     )
 
 

@@ -210,21 +210,21 @@ class Statistics(ByValue, Listed):
             "consistent" only if the runs would have shown an error of σ of attitude, bias and innovations by ``detectable_error``.
         """
         tail(confidence_level)
-        chosen = judged_epochs(len(self.time) - 1) if epochs is None else np.array(list(epochs), int)
-        failed = int(self.runs - np.min(self.finite[chosen]))
+        rows = judged_epochs(len(self.time) - 1) if epochs is None else np.array(list(epochs), int)
+        failed = int(self.runs - np.min(self.finite[rows]))
         findings = []
         for subset in self.subsets:
-            findings.append(_anees(self, chosen, subset, confidence_level, failed))
+            findings.append(_anees(self, rows, subset, confidence_level, failed))
             if failed == 0:
-                findings.append(_log_nees(self, chosen, subset))
+                findings.append(_log_nees(self, rows, subset))
         if failed == 0 and self.runs >= 3:
-            findings += [_mean_error(self, chosen), _run_coverage(self, chosen)]
+            findings += [_mean_error(self, rows), _run_coverage(self, rows)]
         for row, sensor in enumerate(self.sensors):
             degrees = float(np.sum(self.sensor_degrees[row]))
             if degrees >= 1.0:
                 mean = float(np.sum(self.sensor_nis_sum[row]) / degrees)
                 findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
-        parts = [f"{INNOVATIONS}{one.of}" for one in findings if one.name == "NIS"]
+        parts = [f"{INNOVATIONS}{finding.of}" for finding in findings if finding.name == "NIS"]
         parts += [name for name in STATES if name in self.subsets]
         return concluded(
             findings,
@@ -241,13 +241,13 @@ class Statistics(ByValue, Listed):
         judgement = self.judge()
         rows = [
             (
-                f"{one.name} of {one.label}",
-                one.value,
-                f"{one.low:.4f} to {one.high:.4f}",
-                "FAIL" if one.rejected else "pass",
+                f"{finding.name} of {finding.label}",
+                finding.value,
+                f"{finding.low:.4f} to {finding.high:.4f}",
+                "FAIL" if finding.rejected else "pass",
             )
-            for one in judgement.findings
-            if one.is_ratio
+            for finding in judgement.findings
+            if finding.is_ratio
         ]
 
         def at_the_end(values: Array, axes: slice, unit: float) -> str:
@@ -406,8 +406,8 @@ class Statistics(ByValue, Listed):
         ndarray (m, 6)
             Quantiles, rad and rad/s.
         """
-        found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
-        return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
+        quantile = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
+        return np.asarray(np.where(self._runs_of_state > 0.0, quantile, np.nan))
 
 
 def _at(statistics: Statistics, epochs: Counts, worst: int) -> str:

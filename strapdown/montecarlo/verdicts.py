@@ -26,15 +26,15 @@ def bound_of(plan: Plan) -> Array | None:
 
     The bound of a matched MEKF is its own covariance. It holds for scenarios with white noise whose initial errors have no fixed part.
     """
-    given = plan.dispersions
-    if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
+    dispersions = plan.dispersions
+    if plan.setup.estimator == MEKF or np.any(dispersions.attitude_error) or np.any(dispersions.bias_error):
         return None
-    attitude_sigma, bias_sigma = initial_sigmas(given, plan.setup)
-    chosen = replace(
+    attitude_sigma, bias_sigma = initial_sigmas(dispersions, plan.setup)
+    setup = replace(
         FilterSetup.for_scenario(plan.scenario, states=False), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma
     )
     try:
-        return covariance.analyse(plan.scenario, chosen, epochs=plan.epochs).cramer_rao
+        return covariance.analyse(plan.scenario, setup, epochs=plan.epochs).cramer_rao
     except InputError:
         return None
 
@@ -68,20 +68,20 @@ def summary(
     dict
         Plain values for JSON.
     """
-    chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    judgement = statistics.judge(epochs=chosen, confidence_level=confidence_level)
-    found = {(one.name, one.of): one for one in judgement.findings}
-    covered = statistics.covered[chosen]
+    rows = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
+    judgement = statistics.judge(epochs=rows, confidence_level=confidence_level)
+    by_name = {(finding.name, finding.of): finding for finding in judgement.findings}
+    covered = statistics.covered[rows]
     table = {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
         "confidence_level": confidence_level,
-        "epochs_judged": len(chosen),
-        "nees": {subset: _nees(statistics, chosen, subset, found["ANEES", subset]) for subset in statistics.subsets},
+        "epochs_judged": len(rows),
+        "nees": {subset: _nees(statistics, rows, subset, by_name["ANEES", subset]) for subset in statistics.subsets},
         "nis": [
-            _nis(statistics, i, found["NIS", name])
+            _nis(statistics, i, by_name["NIS", name])
             for i, name in enumerate(statistics.sensors)
-            if ("NIS", name) in found
+            if ("NIS", name) in by_name
         ],
         "coverage": {
             "expected": list(COVERED),
@@ -89,7 +89,7 @@ def summary(
             "bias": covered[:, 3:].mean(axis=(0, 1)),
         },
         "last_epoch": _last_epoch(statistics),
-        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, chosen)}),
+        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, rows)}),
         "worst_runs": [
             {"run": int(run), "largest_nees": score}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)

@@ -38,9 +38,9 @@ class ErrorObjective(Objective):
     def derivatives(self, point: Array) -> Derivatives:
         """Return value, gradient and curvature at a point."""
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))])
-        found = self.each(self.errors_of, [(number, rows) for number in range(len(self.references))])
-        error = np.concatenate([e for e, _ in found])
-        P = np.concatenate([covariance for _, covariance in found])
+        parts = self.each(self.errors_of, [(number, rows) for number in range(len(self.references))])
+        error = np.concatenate([e for e, _ in parts])
+        P = np.concatenate([covariance for _, covariance in parts])
         scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # attitude in rad, bias in rad/s
         error, P = error / scale[:, None], P / (scale[:, None, :, None] * scale[:, None, None, :])
         inverse = np.linalg.inv(P[:, 0])
@@ -72,7 +72,7 @@ class ErrorObjective(Objective):
 
 def error_objective(
     cases: Sequence[Case],
-    chosen: FilterSetup,
+    filter_setup: FilterSetup,
     free: Sequence[str],
     *,
     threads: int = 1,
@@ -81,7 +81,7 @@ def error_objective(
 
     The likelihood of the errors under the filter's covariance requires small errors.
     """
-    problem = make_problem(cases, chosen, free, threads=threads)
+    problem = make_problem(cases, filter_setup, free, threads=threads)
     base = with_engine(problem)
     references = tuple(_spread(base, number) for number in range(len(base.cases)))
     return construct(ErrorObjective, problem, base=base, references=references)
@@ -123,7 +123,7 @@ def reference(case: Case, edges: np.ndarray) -> Reference:
 def _spread(base: Likelihood, number: int) -> Reference:
     """Return the truth of a record at edges spaced by the correlation time of the attitude error at the starting point."""
     case = base.cases[number]
-    known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
+    known = reference(case, np.arange(0, len(case.record.time), base.filter_setup.integration.samples))
     picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
     m = len(picked.epochs)
     if m < 100:

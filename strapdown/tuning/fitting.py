@@ -77,9 +77,13 @@ class Optimum:
 
 def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) -> Local:
     """Return the objective with its priors at a point."""
-    found = objective.derivatives(point)
+    derivatives = objective.derivatives(point)
     objective.evaluated()
-    value, score, information = float(found.value.sum()), found.score.sum(axis=0), found.information.copy()
+    value, score, information = (
+        float(derivatives.value.sum()),
+        derivatives.score.sum(axis=0),
+        derivatives.information.copy(),
+    )
     for j, name in enumerate(objective.names):
         if name in priors:
             prior = priors[name]
@@ -87,7 +91,7 @@ def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) ->
             value += 0.5 * away**2
             score[j] += away / prior.spread
             information[j, j] += prior.spread**-2
-    return Local(value=value, score=score, information=information, derivatives=found)
+    return Local(value=value, score=score, information=information, derivatives=derivatives)
 
 
 def search(
@@ -244,14 +248,19 @@ class Tuning(Listed):
         """
         content: dict[str, Any] = {
             "parameters": [
-                {**vars(one), "note": one.words, "unit": one.unit.name, "si_per_unit": one.unit.factor}
-                for one in self.parameters
+                {
+                    **vars(parameter),
+                    "note": parameter.words,
+                    "unit": parameter.unit.name,
+                    "si_per_unit": parameter.unit.factor,
+                }
+                for parameter in self.parameters
             ],
             "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
             "objective": {"name": self.measure, "before": self.before, "after": self.after},
             "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
             "innovations_fit": not self.misfit,
-            "unmodelled": [one.summary() for one in self.unmodelled],
+            "unmodelled": [check.summary() for check in self.unmodelled],
         }
         if self.gate is not None:
             content["gate"] = {
@@ -260,14 +269,14 @@ class Tuning(Listed):
         if self.comparison is not None:
             content["held_out"] = self.comparison.summary()
         answer, reason, details = verdict(self)
-        shown = {"words": list(self.words), "tables": [one.as_text for one in self.tables]}
+        shown = {"words": list(self.words), "tables": [table.as_text for table in self.tables]}
         content["report"] = {"verdict": answer, "reason": reason, "details": details, **shown}
         return plain(content)  # type: ignore[no-any-return]
 
     @property
     def words(self) -> tuple[str, ...]:
         """Sentences on what the parameters do not say: the gate, errors that the filter does not model."""
-        worst = max(self.unmodelled, key=lambda one: one.severity, default=None)
+        worst = max(self.unmodelled, key=lambda check: check.severity, default=None)
         return (*(() if self.gate is None else (self.gate.words,)), *(() if worst is None else worst.words))
 
     @property
@@ -278,14 +287,16 @@ class Tuning(Listed):
     def listing(self) -> Table:
         """Return the parameters with their intervals, as a table."""
         rows = []
-        for one in self.parameters:
-            values = (x / one.unit.factor for x in (one.start, one.value, one.lower, one.upper))
-            rows.append((one.name, one.unit.name, *values, one.words, one.identified))
+        for parameter in self.parameters:
+            values = (
+                x / parameter.unit.factor for x in (parameter.start, parameter.value, parameter.lower, parameter.upper)
+            )
+            rows.append((parameter.name, parameter.unit.name, *values, parameter.words, parameter.identified))
         notes = [
             f"{self.agreeing} of {len(self.starts)} searches ended at the best point; log-likelihood + "
             f"{self.before - self.after:.4g}."
         ]
-        if not all(one.identified for one in self.parameters):
+        if not all(parameter.identified for parameter in self.parameters):
             notes.append(
                 "For a parameter that is not identified these records give only an upper bound; the filter uses the value in the column "
                 f"“after”, the mean below that bound. A prior can be given by {Hint('priors')}."
@@ -312,8 +323,8 @@ class Tuning(Listed):
 
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter with this name."""
-        known_keys("tuning", [name], [one.name for one in self.parameters])
-        return next(one for one in self.parameters if one.name == name)
+        known_keys("tuning", [name], [parameter.name for parameter in self.parameters])
+        return next(parameter for parameter in self.parameters if parameter.name == name)
 
 
 VERDICTS = ("consistent", "cannot tell", "not consistent")
@@ -324,17 +335,17 @@ def verdict(tuning: Tuning) -> tuple[str, str, list[str]]:
     comparison = tuning.comparison
     if comparison is None:
         prove = f"{Hint('holdout')} validates a tuning on held-out data"
-        details = [words for one in tuning.unmodelled for words in one.words]
+        details = [words for check in tuning.unmodelled for words in check.words]
         if tuning.misfit or details:
             return "not consistent", f"the tuned filter does not agree with the data used for tuning; {prove}", details
-        if any(one.judgement.innovations_untested for one in tuning.unmodelled):
+        if any(check.judgement.innovations_untested for check in tuning.unmodelled):
             return "cannot tell", f"the data used for tuning are too few to judge the filter; {prove}", []
         return "consistent", f"the tuned filter agrees with the data used for tuning; {prove}", []
     after = comparison.after.judgements
     if not after:
         return "cannot tell", "the held-out data were not judged", []
-    worst = max(after, key=lambda one: VERDICTS.index(one.verdict))
-    details = [finding.means for one in after for finding in one.findings if finding.rejected]
+    worst = max(after, key=lambda judgement: VERDICTS.index(judgement.verdict))
+    details = [finding.means for judgement in after for finding in judgement.findings if finding.rejected]
     if not comparison.better and tuning.measure == "likelihood":
         details.append("on the held-out data the likelihood has decreased: keep the previous filter")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
@@ -479,7 +490,7 @@ def _best(optima: Sequence[Optimum]) -> Optimum:
 
 def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], priors: Mapping[str, Prior]) -> Array:
     """Return a point with the parameters that are not identified at their means, and the others most likely given these."""
-    loose = [j for j, one in enumerate(ranges) if not one.identified]
+    loose = [j for j, interval in enumerate(ranges) if not interval.identified]
     if not loose:
         return point.copy()
     moved = point.copy()
@@ -503,9 +514,9 @@ class _Stage:
         self.what = f"{what}: 0 of {len(jobs)}"
 
         def counted(job: Any) -> T:
-            found = work(job)
+            result = work(job)
             self.what = f"{what}: {next(done)} of {len(jobs)}"
-            return found
+            return result
 
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(counted, jobs))
@@ -566,16 +577,21 @@ def slices(objective: Objective, tuning: Tuning) -> Slices:
     """
     grid = np.linspace(-1.0, 1.0, SLICE_POINTS) ** 3
     values, fallen = [], []
-    for j, one in enumerate(tuning.parameters):
-        width = 2.5 * min(max(one.standard_error, 1e-3), 1.0)
-        top = one.upper if np.isfinite(one.upper) else one.value * np.exp(width)
-        ends = np.log([max(min(one.lower, one.value), one.value * np.exp(-2.0 * width), 1e-300), max(top, one.value)])
+    for j, parameter in enumerate(tuning.parameters):
+        width = 2.5 * min(max(parameter.standard_error, 1e-3), 1.0)
+        top = parameter.upper if np.isfinite(parameter.upper) else parameter.value * np.exp(width)
+        ends = np.log(
+            [
+                max(min(parameter.lower, parameter.value), parameter.value * np.exp(-2.0 * width), 1e-300),
+                max(top, parameter.value),
+            ]
+        )
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (SLICE_POINTS, 1))
         points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
-        found = objective.minus_log(points)
+        value = objective.minus_log(points)
         values.append(np.exp(points[:, j]))
-        fallen.append(2.0 * (found - found.min()))
+        fallen.append(2.0 * (value - value.min()))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
 
 
@@ -613,16 +629,16 @@ def _profiled(
 
     centre = best.point[j]
     warm = best.point.copy()
-    seen: dict[float, float] = {centre: 0.0}
+    drops: dict[float, float] = {centre: 0.0}
 
     def fallen(x: float) -> float:
         """2 Δℓ of the profile at log value x."""
-        if x not in seen:
+        if x not in drops:
             warm[j] = x
-            found = search(objective, warm, priors, fixed=[j], steps=50)
-            warm[:] = found.point
-            seen[x] = 2.0 * (found.local.value - best.local.value) / swollen
-        return seen[x]
+            optimum = search(objective, warm, priors, fixed=[j], steps=50)
+            warm[:] = optimum.point
+            drops[x] = 2.0 * (optimum.local.value - best.local.value) / swollen
+        return drops[x]
 
     nothing = -np.inf if objective.names[j] == RRW else centre - 7.0
     at_zero = fallen(nothing) if objective.names[j] not in priors else np.inf
@@ -658,16 +674,16 @@ def _profiled(
 
 
 def _note(
-    name: str, found: _Known, error: float, local: Local, j: int, priors: Mapping[str, Prior], *, doubtful: bool
+    name: str, known: _Known, error: float, local: Local, j: int, priors: Mapping[str, Prior], *, doubtful: bool
 ) -> str:
     if name in priors:
         share = 1.0 - priors[name].spread ** -2 / local.information[j, j]
         if share < 0.5:
             return "from the prior; this record adds little"
-    if not found.identified:
+    if not known.identified:
         return NOT_IDENTIFIED
     if doubtful and name != SCALE:
         return "in doubt: the innovations contradict the filter's model"
-    if found.lower == 0.0 or found.upper > 4.0 * found.lower:
+    if known.lower == 0.0 or known.upper > 4.0 * known.lower:
         return "identified, but poorly"
     return "identified" if error < WELL_KNOWN else "identified roughly"

@@ -66,7 +66,7 @@ def by_innovations(names: Sequence[str] | None, spacing: float = 0.0, **more: An
     free the error grows on nine of them, from 3.0° to 7.7° on average; scaled by all innovations, the NEES is up to 28. ``more`` holds
     other options, which need a valid likelihood.
     """
-    wanted = [name for name in names or [] if name != SCALE] + [name for name, given in more.items() if given]
+    wanted = [name for name in names or [] if name != SCALE] + [name for name, is_wanted in more.items() if is_wanted]
     if wanted:
         raise InputError(
             f"{wanted[0]} cannot be tuned by the innovations of a recording: its disturbances last, so a filter of larger likelihood is "
@@ -75,7 +75,7 @@ def by_innovations(names: Sequence[str] | None, spacing: float = 0.0, **more: An
     return (SCALE,) if names is None else names, spacing or INDEPENDENT
 
 
-def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
+def record_case(record: ImuRecord, filter_setup: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
     """Return a record with the filter's initial state.
 
     Parameters
@@ -102,12 +102,12 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
         If the first measurements do not determine the attitude.
     """
     if seed is not None and record.truth is not None:
-        return Case(record=record, initial=setup.drawn_state(chosen, record, seed), name=name)
+        return Case(record=record, initial=setup.drawn_state(filter_setup, record, seed), name=name)
     try:
-        first = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        first = estimation.first_state(record, filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma)
     except InputError as error:
         raise InputError(f"{name or 'record'}: {error}") from None
-    return Case(record=record, initial=setup.initial_state(chosen, first.attitude), name=name)
+    return Case(record=record, initial=setup.initial_state(filter_setup, first.attitude), name=name)
 
 
 NOISES = (
@@ -127,7 +127,7 @@ def one_gyro(specs: Mapping[str, GyroSpec]) -> None:
     names = list(specs)
     for name in names[1:]:
         for field in NOISES:
-            first, other = (np.broadcast_to(getattr(specs[one], field), (3,)) for one in (names[0], name))
+            first, other = (np.broadcast_to(getattr(specs[sensor], field), (3,)) for sensor in (names[0], name))
             if not np.allclose(first, other, rtol=1e-9, atol=0.0):
                 k = int(np.argmax(first != other))
                 raise InputError(

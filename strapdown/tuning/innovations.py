@@ -101,29 +101,29 @@ class Likelihood(Objective):
         blocks = [tuple(range(p))] if p <= MAX_DERIVATIVES else _pairs_of_groups(p)
         jobs = [(case, point, block) for case in self.prepared for block in blocks]
         results = self.each(self._differences, jobs)
-        found = []
+        parts = []
         for k in range(0, len(results), len(blocks)):
             score, information = np.zeros((len(results[k].value), p)), np.zeros((p, p))
             for block, part in zip(blocks, results[k : k + len(blocks)], strict=True):
                 score[:, block] = part.score
                 information[np.ix_(block, block)] = part.information
-            found.append(replace(results[k], score=score, information=information))
-        return joined(found)
+            parts.append(replace(results[k], score=score, information=information))
+        return joined(parts)
 
     def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> Derivatives:
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))[list(block)]])
-        found = self._pass(case, rows, free=len(block))
-        lower = found["information"]
+        written = self._pass(case, rows, free=len(block))
+        lower = written["information"]
         return Derivatives(
-            value=found["minus_log"][case.used, 0],
-            score=found["score"][case.used],
+            value=written["minus_log"][case.used, 0],
+            score=written["score"][case.used],
             information=(lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0),
         )
 
     @property
     def curvature(self) -> Callable[[Array], Array] | None:
         """The observed information at a point, with error states, of which one record has few draws."""
-        return None if self.chosen.states is None else self._curvature
+        return None if self.filter_setup.states is None else self._curvature
 
     def _curvature(self, point: Array) -> Array:
         """Return the second derivatives of minus the log likelihood at a point (p, p)."""
@@ -134,13 +134,13 @@ class Likelihood(Objective):
 
     def judged(self, point: Array) -> list[tuple[str, Array]]:
         """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
-        found = []
+        judged = []
         for case in self.prepared:
             rows = self._pass(case, point[None], judged=True)["probability"]
             events = case.problem.events
             used = case.used[np.searchsorted(case.cuts, events.time, side="left")]
-            found += [(name, rows[used & (events.sensor == k)]) for k, name in enumerate(events.sensors)]
-        return found
+            judged += [(name, rows[used & (events.sensor == k)]) for k, name in enumerate(events.sensors)]
+        return judged
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), whole bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p).
@@ -148,18 +148,18 @@ class Likelihood(Objective):
         If the setup has a gate or robust weights, they are applied.
         """
         case = self.prepared[number]
-        if self.chosen.gate is None and self.chosen.robust is None:
+        if self.filter_setup.gate is None and self.filter_setup.robust is None:
             jobs = [(case, points[first : first + WIDTH], epochs) for first in range(0, len(points), WIDTH)]
             parts = self.each(self._estimates, jobs)
         else:
             parts = self.each(self._gated, [(case, point, epochs) for point in points])
-        attitude, bias, P = (np.concatenate(one, axis=1) for one in zip(*parts, strict=True))
+        attitude, bias, P = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
         return attitude, bias, P
 
     def _estimates(self, case: Prepared, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
-        found = self._pass(case, points, epochs=epochs)
+        written = self._pass(case, points, epochs=epochs)
         m, k = len(epochs), len(points)
-        x, triangle = (np.moveaxis(found[name].reshape(m, -1, WIDTH), 1, 2)[:, :k] for name in ("x", "P"))
+        x, triangle = (np.moveaxis(written[name].reshape(m, -1, WIDTH), 1, 2)[:, :k] for name in ("x", "P"))
         n = x.shape[2] - 1
         P = np.empty((m, k, n, n))
         a, b = np.triu_indices(n)
@@ -172,20 +172,25 @@ class Likelihood(Objective):
             slopes = _slopes(case.problem.error_states)
             whole[..., 3:, 6 + slopes.start : 6 + slopes.stop] *= case.warming[epochs, None, None, None]
         bias = (whole[..., 3:, 3:] @ x[..., 4:, None])[..., 0]
-        fast = np.array([0.0 if one.states is None else one.states.gyro_fast_bias_sigma for one in setups])
+        fast = np.array(
+            [
+                0.0 if filter_setup.states is None else filter_setup.states.gyro_fast_bias_sigma
+                for filter_setup in setups
+            ]
+        )
         at_start = np.where((epochs == 0) & (len(case.case.initial.values) == 0), -1.0, 1.0)
         added = (at_start[:, None] * fast**2)[..., None, None] * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         return x[..., :4], bias, whole @ P @ np.swapaxes(whole, -1, -2) + added
 
     def _gated(self, case: Prepared, point: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
-        chosen = self.setup(point)
+        filter_setup = self.setup(point)
         every = max(1, int(np.gcd.reduce(epochs)))  # fewer rows, with the steps between them taken together
-        record, initial = self.modelled(case.steps, chosen), self.initial(case.case, chosen)
+        record, initial = self.modelled(case.steps, filter_setup), self.initial(case.case, filter_setup)
         options: dict[str, Any] = {"motion": case.problem.motion, "every": every, "full_covariance": True}
-        found = setup.run_modelled(record, chosen, initial, **options)
+        estimate = setup.run_modelled(record, filter_setup, initial, **options)
         rows = epochs // every
-        assert found.covariance is not None
-        return found.attitude[rows, None], found.bias[rows, None], found.covariance[rows, None]
+        assert estimate.covariance is not None
+        return estimate.attitude[rows, None], estimate.bias[rows, None], estimate.covariance[rows, None]
 
     # ------------------------------------------------------------------------------------------------------- lanes
 
@@ -201,7 +206,7 @@ class Likelihood(Objective):
         _, first, place = np.unique(points[:, others], axis=0, return_index=True, return_inverse=True)
         # Zero, −∞, would be no state.
         setups = [self.setup(np.maximum(points[k], self.start - 2.0 * REACH)) for k in first]
-        filters = [_filter(self, case.case, case.problem.events, chosen) for chosen in setups]
+        filters = [_filter(self, case.case, case.problem.events, filter_setup) for filter_setup in setups]
         return [filters[k] for k in place.ravel()]
 
     def _factors(self, case: Prepared, lane: dict[str, Array]) -> Array:
@@ -220,24 +225,24 @@ class Likelihood(Objective):
         """Return the filters of up to eight points (k, p); those of the first fill the lanes that remain."""
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
-        noise, ones = self.chosen.process_noise, lane.get(SCALE, np.ones(WIDTH))
+        noise, ones = self.filter_setup.process_noise, lane.get(SCALE, np.ones(WIDTH))
         models, states = zip(*self._filters(case, rows), strict=True)
         model, kernels, upper = models[0], case.kernels, np.triu_indices(case.kernels.N)
-        decay, chains = np.stack([one.decay for one in models]), np.stack([one.chains for one in models])
+        decay, chains = np.stack([model.decay for model in models]), np.stack([model.chains for model in models])
         rates = [(a.tobytes(), b.tobytes()) for a, b in zip(decay, chains, strict=True)]
         x, P = np.zeros((2, (kernels.N + 1) * WIDTH)), np.zeros((2, kernels.SIZE_OF_P))
-        x[0] = _in_lanes([np.concatenate([one.attitude, one.bias, one.values]) for one in states])
-        P[0] = _in_lanes([one.covariance[upper] for one in states])
+        x[0] = _in_lanes([np.concatenate([state.attitude, state.bias, state.values]) for state in states])
+        P[0] = _in_lanes([state.covariance[upper] for state in states])
         return kernel.Body(
             filters=structure.Body(
                 model=structure.Model(
                     angle_variance=lane.get(ARW, ones * noise.angle_random_walk) ** 2,
                     rate_variance=lane.get(RRW, ones * noise.rate_random_walk) ** 2,
-                    numbers=_in_lanes([one.numbers for one in models]),
+                    numbers=_in_lanes([model.numbers for model in models]),
                     decay=_in_lanes(list(decay)),
                     chains=_in_lanes(list(chains)),
                     last=model.last,
-                    limit=min(one.limit for one in models),
+                    limit=min(model.limit for model in models),
                     force_f=tuple(model.force_f.tolist()),
                 ),
                 x=x,
@@ -253,7 +258,7 @@ class Likelihood(Objective):
             ),
             decay=decay,
             chains=chains,
-            same=np.array([rates.index(one) for one in rates]),
+            same=np.array([rates.index(rate) for rate in rates]),
             coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
             driven=case.driven,
             temperature=0.5 * (case.warming[1:] + case.warming[:-1]),
@@ -313,12 +318,12 @@ Made = TypeVar("Made", bound=Objective)
 
 def construct(kind: type[Made], problem: Objective, **more: Any) -> Made:
     """Return an objective of this class for a problem."""
-    return kind(**{one.name: getattr(problem, one.name) for one in fields(Objective)} | more)
+    return kind(**{field.name: getattr(problem, field.name) for field in fields(Objective)} | more)
 
 
 def likelihood(
     cases: Sequence[Case],
-    chosen: FilterSetup,
+    filter_setup: FilterSetup,
     free: Sequence[str],
     *,
     spacing: float = 0.0,
@@ -350,7 +355,7 @@ def likelihood(
     Objective
         For :func:`fit`.
     """
-    return with_engine(make_problem(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
+    return with_engine(make_problem(cases, filter_setup, free, spacing=spacing, parts=parts, threads=threads))
 
 
 def with_engine(problem: Objective) -> Likelihood:
@@ -358,38 +363,42 @@ def with_engine(problem: Objective) -> Likelihood:
     return construct(Likelihood, problem, prepared=tuple(_prepared(problem, case) for case in problem.cases))
 
 
-def _filter(problem: Objective, case: Case, events: Schedule, chosen: FilterSetup) -> tuple[Model, State]:
+def _filter(problem: Objective, case: Case, events: Schedule, filter_setup: FilterSetup) -> tuple[Model, State]:
     """Return the model of the error states of a setup, and the initial state with them."""
-    states, kinds = chosen.states or States(), dict(zip(events.sensors, events.kinds, strict=True))
+    states, kinds = filter_setup.states or States(), dict(zip(events.sensors, events.kinds, strict=True))
     blocks = states.blocks(kinds)
-    start = state_of_whole_bias(problem.initial(case, chosen), blocks, states.gyro_fast_bias_sigma)
+    start = state_of_whole_bias(problem.initial(case, filter_setup), blocks, states.gyro_fast_bias_sigma)
     model = modelling.assemble(blocks, kinds, isotropic=events.noise_by_axis is None, generic=True)
     return model, modelling.begin(start, blocks)
 
 
 def _prepared(problem: Objective, case: Case) -> Prepared:
-    steps = setup.at_steps(case.record, problem.chosen)
-    record = problem.modelled(steps, problem.chosen)
-    motion = setup.measured_motion(record, problem.chosen)
-    found = replace(setup.prepared(record, problem.chosen, problem.initial(case, problem.chosen)), motion=motion)
-    model, state = _filter(problem, case, found.events, problem.chosen)
+    steps = setup.at_steps(case.record, problem.filter_setup)
+    record = problem.modelled(steps, problem.filter_setup)
+    motion = setup.measured_motion(record, problem.filter_setup)
+    prepared = replace(
+        setup.prepared(record, problem.filter_setup, problem.initial(case, problem.filter_setup)), motion=motion
+    )
+    model, state = _filter(problem, case, prepared.events, problem.filter_setup)
     start, end = float(record.time[0]), float(record.time[-1])
     first, last = max(case.first, start), min(case.last, end)
     inner = list(np.linspace(first, last, problem.parts + 1)[1:-1])
     before = [np.nextafter(case.first, -np.inf)] if case.first > start else []
     after = [case.last] if case.last < end else []
-    slopes = _slopes(found.error_states)
+    slopes = _slopes(prepared.error_states)
     hot = range(6 + slopes.start, 6 + slopes.stop)
     return Prepared(
         case=case,
         steps=steps,
-        problem=found,
+        problem=prepared,
         filter=(model, state),
         kernels=machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH, PARAMETERS=True),
         cuts=np.array([*before, *inner, *after]),
         used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
-        lengths=forward.lengths(record, found.events, found.model, forward.unit_sigmas(record, found.model, {})),
-        turning=forward.turns(found),
+        lengths=forward.lengths(
+            record, prepared.events, prepared.model, forward.unit_sigmas(record, prepared.model, {})
+        ),
+        turning=forward.turns(prepared),
         warming=temperature.of(record) - temperature.of(record)[0] if hot else np.empty(0),
         driven=np.array([g.offset[g.state - hot[0]][0] for g in model.structure.gyro if g.state in hot], np.int64),
     )

@@ -84,10 +84,10 @@ class Case:
         return max(self.first, float(self.record.time[0])), min(self.last, float(self.record.time[-1]))
 
 
-def of_sensors(chosen: FilterSetup, record: ImuRecord) -> FilterSetup:
+def of_sensors(filter_setup: FilterSetup, record: ImuRecord) -> FilterSetup:
     """Return a setup without the σ of sensors that are not in the record."""
     own = {series.sensor for series in record.vectors}
-    return replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+    return replace(filter_setup, sigma={name: value for name, value in filter_setup.sigma.items() if name in own})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,12 +107,12 @@ def outliers_at(points: Array) -> tuple[Array, Array]:
     return np.minimum(np.exp(points[..., -2]), 0.9), np.exp(2.0 * points[..., -1])
 
 
-def joined(found: Sequence[Derivatives]) -> Derivatives:
+def joined(parts: Sequence[Derivatives]) -> Derivatives:
     """Return the derivatives of several records together."""
     return Derivatives(
-        value=np.concatenate([one.value for one in found]),
-        score=np.concatenate([one.score for one in found]),
-        information=np.sum([one.information for one in found], axis=0),
+        value=np.concatenate([part.value for part in parts]),
+        score=np.concatenate([part.score for part in parts]),
+        information=np.sum([part.information for part in parts], axis=0),
     )
 
 
@@ -125,7 +125,7 @@ class Objective:
 
     names: tuple[str, ...]
     """Names of the free parameters."""
-    chosen: FilterSetup
+    filter_setup: FilterSetup
     """Setup with the values of the fixed parameters."""
     start: Array
     """Logarithms of the free parameters in that setup (p,)."""
@@ -172,7 +172,9 @@ class Objective:
     def setup(self, point: Array) -> FilterSetup:
         """Return the filter setup of a point, with the gate unchanged."""
         values = zip(self.names, np.exp(point).tolist(), strict=True)
-        return with_values(self.chosen, {name: self._bounded(name, x) for name, x in values if name not in OUTLIERS})
+        return with_values(
+            self.filter_setup, {name: self._bounded(name, x) for name, x in values if name not in OUTLIERS}
+        )
 
     def _bounded(self, name: str, value: float) -> float:
         """Return the value of a parameter of error states, limited to its range."""
@@ -192,24 +194,26 @@ class Objective:
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(lambda job: work(*job), jobs))
 
-    def modelled(self, record: ImuRecord, chosen: FilterSetup) -> ImuRecord:
+    def modelled(self, record: ImuRecord, filter_setup: FilterSetup) -> ImuRecord:
         """Return a record at the rate of the filter's steps as processed by the filter of a setup, with thinned measurements."""
-        record = setup.with_sigma(record, of_sensors(chosen, record))
+        record = setup.with_sigma(record, of_sensors(filter_setup, record))
         if self.spacing > 0.0:
             record = replace(record, vectors=tuple(thinned(series, self.spacing) for series in record.vectors))
         return record
 
-    def initial(self, case: Case, chosen: FilterSetup) -> State:
+    def initial(self, case: Case, filter_setup: FilterSetup) -> State:
         """Return the initial state of the filter of a setup."""
         if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
-            return setup.initial_state(chosen, case.initial.attitude, case.initial.bias)
-        factor = chosen.measurement_sigma_factor / self.chosen.measurement_sigma_factor  # the common scale of all σ
+            return setup.initial_state(filter_setup, case.initial.attitude, case.initial.bias)
+        factor = (
+            filter_setup.measurement_sigma_factor / self.filter_setup.measurement_sigma_factor
+        )  # the common scale of all σ
         return case.initial if factor == 1.0 else replace(case.initial, covariance=factor**2 * case.initial.covariance)
 
 
 def make_problem(
     cases: Sequence[Case],
-    chosen: FilterSetup,
+    filter_setup: FilterSetup,
     free: Sequence[str],
     *,
     spacing: float = 0.0,
@@ -217,21 +221,21 @@ def make_problem(
     threads: int = 1,
 ) -> Objective:
     """Return the checked problem of a tuning: records, filter and parameters, without an objective on the records."""
-    setup.need_mekf(chosen, "tuning by name")
+    setup.need_mekf(filter_setup, "tuning by name")
     if not cases:
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]
-    names = checked_names(free, chosen, records)
-    chosen = by_axis(chosen, names, records)
-    values = values_of(chosen, names, records)
+    names = checked_names(free, filter_setup, records)
+    filter_setup = by_axis(filter_setup, names, records)
+    values = values_of(filter_setup, names, records)
     for name, value in values.items():
         if value <= 0.0:
             raise InputError(f"{name} starts from {value:g}; it must start from a number greater than zero")
     for case in cases:
-        _check_case(case, chosen)
+        _check_case(case, filter_setup)
     return Objective(
         names=names,
-        chosen=with_values(chosen, values),
+        filter_setup=with_values(filter_setup, values),
         start=np.log(list(values.values())),
         cases=tuple(cases),
         parts=count("parts", parts),
@@ -240,13 +244,15 @@ def make_problem(
     )
 
 
-def _check_case(case: Case, chosen: FilterSetup) -> None:
+def _check_case(case: Case, filter_setup: FilterSetup) -> None:
     """Refuse a record without data for tuning, or without a sensor that has error states."""
     what = case.name or "record"
-    for sensor in () if chosen.states is None else chosen.states.sensors:
+    for sensor in () if filter_setup.states is None else filter_setup.states.sensors:
         one_of(f"{what}: sensor of the states", sensor, [series.sensor for series in case.record.vectors])
     first, last = case.span
-    if not any(np.any(_usable(one) & (one.time >= first) & (one.time <= last)) for one in case.record.vectors):
+    if not any(
+        np.any(_usable(series) & (series.time >= first) & (series.time <= last)) for series in case.record.vectors
+    ):
         raise InputError(
             f"{what} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
         )

@@ -43,7 +43,7 @@ MIN_REFUSED = 1e-9
 
 def contaminated_likelihood(
     cases: Sequence[Case],
-    chosen: FilterSetup,
+    filter_setup: FilterSetup,
     free: Sequence[str],
     *,
     share: float = SHARE,
@@ -54,7 +54,7 @@ def contaminated_likelihood(
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
-    base = likelihood(cases, chosen, free, threads=threads)
+    base = likelihood(cases, filter_setup, free, threads=threads)
     return replace(base, names=(*base.names, *OUTLIERS), start=np.concatenate([base.start, np.log([share, scale])]))
 
 
@@ -91,26 +91,28 @@ class TunedGate:
 def tuned_gate(objective: Likelihood, tuning: Tuning) -> TunedGate:
     """Return the gate at the Bayes threshold, with its interval from those of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
-    seen = _seen(objective, tuning.point[:-2])
-    best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))
-    chosen = {name: float(value[0]) for name, value in thresholds.items()}
+    squares = _seen(objective, tuning.point[:-2])
+    best, thresholds = _probability(squares, np.array([[share.value, scale.value]]))
+    by_sensor = {name: float(value[0]) for name, value in thresholds.items()}
     if not share.identified or share.value > MAX_REFUSED:
         return TunedGate(
             gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
         )
     # Standard errors by the sandwich if the tuning used it.
-    swollen = np.array([one.standard_error for one in (share, scale)]) / np.sqrt(np.diag(tuning.covariance)[-2:])
+    swollen = np.array([estimate.standard_error for estimate in (share, scale)]) / np.sqrt(
+        np.diag(tuning.covariance)[-2:]
+    )
     covariance = tuning.covariance[-2:, -2:] * swollen[:, None] * swollen
     normal = np.random.default_rng(0).standard_normal((DRAWS, 2)) @ np.linalg.cholesky(covariance).T
     tried = np.exp(np.log([share.value, scale.value]) + normal)
     tried = np.column_stack([np.minimum(tried[:, 0], SHARES[1]), np.maximum(tried[:, 1], 1.01)])
-    lower, upper = np.quantile(_probability(seen, tried)[0], [0.025, 0.975])
+    lower, upper = np.quantile(_probability(squares, tried)[0], [0.025, 0.975])
     return TunedGate(
         gate=replace(tuning.setup.gate or Gate(), probability=float(best[0])),
         probability=float(best[0]),
         lower=float(lower),
         upper=float(upper),
-        thresholds=chosen,
+        thresholds=by_sensor,
         share=share,
         scale=scale,
     )
@@ -126,7 +128,7 @@ def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> 
         share=float(np.clip(share, *SHARES)),
         scale=float(np.clip(scale, *SCALES)),
     )
-    number = sum(one.degrees * one.number for one in _seen(other, other.start[:-2]).values())
+    number = sum(group.degrees * group.number for group in _seen(other, other.start[:-2]).values())
     return float(-other.minus_log(other.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
 
 
@@ -153,16 +155,16 @@ def _seen(objective: Likelihood, point: Array) -> dict[str, _Seen]:
     }
 
 
-def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:
+def _probability(squares: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:
     """Return the probability that a valid measurement is accepted, and the thresholds of the sensors, for each share and scale (k, 2)."""
     from scipy.special import chdtrc
 
     share, scale = tried.T
     thresholds, refused, total = {}, np.zeros(len(tried)), 0
-    for name, one in seen.items():
-        wider = 1.0 + (scale**2 - 1.0) * one.noise
-        odds = np.log1p(-share) - np.log(share) + 0.5 * one.degrees * np.log(wider)
+    for name, group in squares.items():
+        wider = 1.0 + (scale**2 - 1.0) * group.noise
+        odds = np.log1p(-share) - np.log(share) + 0.5 * group.degrees * np.log(wider)
         thresholds[name] = np.maximum(2.0 * odds / (1.0 - 1.0 / wider), 0.0)
-        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), MIN_REFUSED))
-        total += one.number
+        refused += group.number * np.log(np.maximum(chdtrc(group.degrees, thresholds[name]), MIN_REFUSED))
+        total += group.number
     return 1.0 - np.exp(refused / total), thresholds

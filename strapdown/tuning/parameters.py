@@ -127,8 +127,8 @@ def axis_of(name: str) -> tuple[str, int] | None:
 
 def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     """Return the names of the σ of single body axes, of every sensor except headings, which have one degree of freedom."""
-    series = [one for record in records for one in record.vectors if len(one.time)]
-    sensors = dict.fromkeys(one.sensor for one in series if one.sensor not in _headings(records))
+    series = [vectors for record in records for vectors in record.vectors if len(vectors.time)]
+    sensors = dict.fromkeys(vectors.sensor for vectors in series if vectors.sensor not in _headings(records))
     return tuple(f"{sensor}{axis}" for sensor in sensors for axis in AXES)
 
 
@@ -150,9 +150,9 @@ def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
 
 
-def checked_names(free: Sequence[str], chosen: FilterSetup, records: Sequence[ImuRecord]) -> tuple[str, ...]:
+def checked_names(free: Sequence[str], filter_setup: FilterSetup, records: Sequence[ImuRecord]) -> tuple[str, ...]:
     """Return the given names, checked: each is a parameter of this filter on these records, none repeats or includes another."""
-    known = [*known_names(records), *axis_names(records), *state_names(chosen.states)]
+    known = [*known_names(records), *axis_names(records), *state_names(filter_setup.states)]
     if not free:
         raise InputError(f"free names no parameter; give some of {', '.join(known)}")
     for name in free:
@@ -199,25 +199,25 @@ def own_sigma(sensor: str, records: Sequence[ImuRecord]) -> float:
 
 def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
     """Return the root mean square of a sensor's σ in the records about each body axis (3,), over all of its measurements."""
-    series = [one for record in records for one in record.vectors if one.sensor == sensor]
-    squares = [np.einsum("kii->ki", one.covariances) for one in series]
+    series = [vectors for record in records for vectors in record.vectors if vectors.sensor == sensor]
+    squares = [np.einsum("kii->ki", vectors.covariances) for vectors in series]
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0))) if squares else np.zeros(3)
 
 
-def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> FilterSetup:
+def by_axis(filter_setup: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> FilterSetup:
     """Return the setup with three σ for each sensor of which ``names`` has an axis: those of the setup, or of the records."""
-    sigma = dict(chosen.sigma)
+    sigma = dict(filter_setup.sigma)
     for sensor in dict.fromkeys(part[0] for part in map(axis_of, names) if part is not None):
-        given = sigma.get(sensor)
-        if isinstance(given, tuple):
+        present = sigma.get(sensor)
+        if isinstance(present, tuple):
             continue
         own = own_axes(sensor, records)
         size = float(np.sqrt(np.mean(own**2)))
-        if given is None and size == 0.0:
+        if present is None and size == 0.0:
             raise _silent(sensor)
-        x, y, z = (own if given is None else given * (own / size if size > 0.0 else np.ones(3))).tolist()
+        x, y, z = (own if present is None else present * (own / size if size > 0.0 else np.ones(3))).tolist()
         sigma[sensor] = x, y, z
-    return replace(chosen, sigma=sigma)
+    return replace(filter_setup, sigma=sigma)
 
 
 def _silent(sensor: str) -> InputError:
@@ -234,64 +234,64 @@ def _size(value: Any) -> float:
 
 def _times(value: Any, factor: float) -> Any:
     """Return a number, or nested tuples of them, times a factor."""
-    return tuple(_times(one, factor) for one in value) if isinstance(value, tuple) else factor * value
+    return tuple(_times(part, factor) for part in value) if isinstance(value, tuple) else factor * value
 
 
-def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
+def values_of(filter_setup: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
     """Return the values of the parameters in a setup."""
-    return {name: _value_of(chosen, name, records) for name in names}
+    return {name: _value_of(filter_setup, name, records) for name in names}
 
 
-def _value_of(chosen: FilterSetup, name: str, records: Sequence[ImuRecord]) -> float:
+def _value_of(filter_setup: FilterSetup, name: str, records: Sequence[ImuRecord]) -> float:
     place = _place(name)
     if name == SCALE:
         return 1.0
     if place is not None:
-        return _size(_at(chosen, place[0]))
+        return _size(_at(filter_setup, place[0]))
     part, sensor = axis_of(name), _sensor(name)
     if part is not None:
-        axes = by_axis(chosen, [name], records).sigma[sensor]
+        axes = by_axis(filter_setup, [name], records).sigma[sensor]
         assert isinstance(axes, tuple)
-        return axes[part[1]] * chosen.measurement_sigma_factor
-    own = _size(chosen.sigma.get(sensor, own_sigma(sensor, records))) * chosen.measurement_sigma_factor
+        return axes[part[1]] * filter_setup.measurement_sigma_factor
+    own = _size(filter_setup.sigma.get(sensor, own_sigma(sensor, records))) * filter_setup.measurement_sigma_factor
     if own == 0.0:
         raise _silent(sensor)
     return own
 
 
-def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
+def with_values(filter_setup: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
     """Return the setup with other values of these parameters; a σ is divided by the setup's factor.
 
     ``SENSOR.sigma`` and the σ of states keep the ratios of their axes; ``SENSOR.sigma.x`` and the like need three in the setup
     (:func:`by_axis`).
     """
     if SCALE in values:
-        return _scaled(chosen, values[SCALE])
-    sigma = dict(chosen.sigma)
+        return _scaled(filter_setup, values[SCALE])
+    sigma = dict(filter_setup.sigma)
     for name, value in values.items():
         place = _place(name)
         if place is None:
-            _set(sigma, name, value / chosen.measurement_sigma_factor)
+            _set(sigma, name, value / filter_setup.measurement_sigma_factor)
             continue
-        given = _at(chosen, place[0])
+        present = _at(filter_setup, place[0])
         if name == "gyro.drift_sigma":  # the part with a bandwidth above that of the states is scaled with them
             fast = ("states", "gyro_fast_bias_sigma")
-            chosen = _put(chosen, fast, value / _size(given) * _at(chosen, fast))
+            filter_setup = _put(filter_setup, fast, value / _size(present) * _at(filter_setup, fast))
         several = place[0][0] == "states"
-        chosen = _put(chosen, place[0], _times(given, value / _size(given)) if several else value)
-    return replace(chosen, sigma=sigma)
+        filter_setup = _put(filter_setup, place[0], _times(present, value / _size(present)) if several else value)
+    return replace(filter_setup, sigma=sigma)
 
 
 def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
     """Set the σ of a sensor, keeping the ratios of its axes, or that of one axis."""
     part, sensor = axis_of(name), _sensor(name)
-    given = sigma.get(sensor)
+    present = sigma.get(sensor)
     if part is None:
-        sigma[sensor] = tuple(value * one / _size(given) for one in given) if isinstance(given, tuple) else value  # type: ignore[assignment]
+        sigma[sensor] = _times(present, value / _size(present)) if isinstance(present, tuple) else value
         return
-    if not isinstance(given, tuple):
+    if not isinstance(present, tuple):
         raise InputError(f"{name}: the setup has no three sigmas for {sensor}; see tuning.parameters.by_axis")
-    x, y, z = (value if k == part[1] else one for k, one in enumerate(given))
+    x, y, z = (value if k == part[1] else axis_sigma for k, axis_sigma in enumerate(present))
     sigma[sensor] = x, y, z
 
 
@@ -304,15 +304,15 @@ def _sigmas_times(owner: Owner, factor: float) -> Owner:
     return replace(owner, **{name: _times(getattr(owner, name), factor) for name in names})
 
 
-def _scaled(chosen: FilterSetup, factor: float) -> FilterSetup:
-    noise, states = chosen.process_noise, chosen.states
+def _scaled(filter_setup: FilterSetup, factor: float) -> FilterSetup:
+    noise, states = filter_setup.process_noise, filter_setup.states
     if states is not None:
-        sensors = {name: _sigmas_times(one, factor) for name, one in states.sensors.items()}
+        sensors = {name: _sigmas_times(sensor, factor) for name, sensor in states.sensors.items()}
         states = replace(_sigmas_times(states, factor), sensors=sensors)
     return replace(
-        _sigmas_times(chosen, factor),
+        _sigmas_times(filter_setup, factor),
         process_noise=replace(noise, **{name: factor * value for name, value in vars(noise).items()}),
-        measurement_sigma_factor=factor * chosen.measurement_sigma_factor,
+        measurement_sigma_factor=factor * filter_setup.measurement_sigma_factor,
         states=states,
     )
 
@@ -364,6 +364,6 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
         Priors of ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
     flickers = np.any(np.asarray(spec.bias_instability) > 0.0)
-    found = vars(setup.FilterSetup.for_record(record, spec).process_noise) if flickers else gyro.process_noise(spec)
-    pairs = {ARW: found["angle_random_walk"], RRW: found["rate_random_walk"]}
+    densities = vars(setup.FilterSetup.for_record(record, spec).process_noise) if flickers else gyro.process_noise(spec)
+    pairs = {ARW: densities["angle_random_walk"], RRW: densities["rate_random_walk"]}
     return {name: Prior(value=value, factor=factor) for name, value in pairs.items() if value > 0.0}

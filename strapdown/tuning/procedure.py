@@ -55,13 +55,13 @@ def objective_for(
         raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
     if truth:
         return error_objective(cases, setup, names, threads=threads)
-    made = (
+    objective = (
         contaminated_likelihood(cases, setup, names, threads=threads)
         if gate
         else likelihood(cases, setup, names, spacing=spacing, threads=threads)
     )
     # If eight points run at once, the threads run searches, otherwise records and points.
-    return dataclasses.replace(made, threads=1) if isinstance(made, Likelihood) else made
+    return dataclasses.replace(objective, threads=1) if isinstance(objective, Likelihood) else objective
 
 
 def tune(
@@ -111,33 +111,33 @@ def tune(
     """
     gate = gate or any(name in GATED for name in names or ())
     wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
-    made = objective_for(cases, setup, wanted, truth=truth, gate=gate, spacing=spacing, threads=threads)
+    objective = objective_for(cases, setup, wanted, truth=truth, gate=gate, spacing=spacing, threads=threads)
     result = fit(
-        made,
+        objective,
         priors=priors,
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(made, Likelihood) or (made.composite and len(cases) == 1) else 1,
+        threads=threads if isinstance(objective, Likelihood) or (objective.composite and len(cases) == 1) else 1,
         progress=progress,
     )
-    found = tuned_gate(made, result) if isinstance(made, Likelihood) and made.mixed else None
-    if found is not None and found.gate is not None:
-        result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
-    result = dataclasses.replace(result, gate=found, comparison=_compared(held, setup, result, made, threads))
+    gated = tuned_gate(objective, result) if isinstance(objective, Likelihood) and objective.mixed else None
+    if gated is not None and gated.gate is not None:
+        result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=gated.gate))
+    result = dataclasses.replace(result, gate=gated, comparison=_compared(held, setup, result, objective, threads))
     result = dataclasses.replace(result, measure="likelihood" + " of the errors" * truth)
-    return Tuned(_examined(cases, setup, result), made, found)
+    return Tuned(_examined(cases, setup, result), objective, gated)
 
 
 def _compared(
-    held: Sequence[Case], before: FilterSetup, result: Tuning, made: Objective, threads: int
+    held: Sequence[Case], before: FilterSetup, result: Tuning, objective: Objective, threads: int
 ) -> Comparison | None:
     """Return the filter before and after on held-out data; None if there are none."""
     if not held:
         return None
     comparison = compare(held, before, result.setup, threads=threads)
-    if isinstance(made, Likelihood) and made.mixed:  # the likelihood after tuning includes the gate
-        likely = log_likelihood(held, made, result)
+    if isinstance(objective, Likelihood) and objective.mixed:  # the likelihood after tuning includes the gate
+        likely = log_likelihood(held, objective, result)
         comparison = dataclasses.replace(comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely))
     return comparison
 
@@ -145,6 +145,6 @@ def _compared(
 def _examined(cases: Sequence[Case], before: FilterSetup, result: Tuning) -> Tuning:
     """Return the tuning with tests for errors that it does not model."""
     tested = examined(cases, before, result)
-    for one in sorted(tested, key=lambda one: one.severity)[-1:]:
-        result = with_misfit_flag(result, one)
+    for check in sorted(tested, key=lambda check: check.severity)[-1:]:
+        result = with_misfit_flag(result, check)
     return dataclasses.replace(result, unmodelled=tested)

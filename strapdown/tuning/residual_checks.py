@@ -74,7 +74,9 @@ class Unmodelled:
     def failed(self) -> tuple[str, ...]:
         """Failed tests in words; σ that are too large do not count, because they are no sign of an unmodelled error."""
         return tuple(
-            one.means for one in self.judgement.findings if one.rejected and not (one.is_ratio and one.value < 1.0)
+            finding.means
+            for finding in self.judgement.findings
+            if finding.rejected and not (finding.is_ratio and finding.value < 1.0)
         )
 
     @property
@@ -96,13 +98,13 @@ class Unmodelled:
             f"After tuning, {self.record or 'the record'} contradicts the filter in a way that no σ explains: an error without a state."
         ]
         if self.moves_with_the_rate:
-            one = self.scale_factor
+            cause = self.scale_factor
             sizes = ", ".join(
-                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(one.estimate, one.standard_error, strict=True)
+                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(cause.estimate, cause.standard_error, strict=True)
             )
             sentences.append(
-                f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {one.gain:.3g}, "
-                f"p = {one.finding.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
+                f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {cause.gain:.3g}, "
+                f"p = {cause.finding.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
             )
         sentences += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MAX_REPORTED]]
         if len(self.failed) > MAX_REPORTED:
@@ -133,15 +135,15 @@ class Unmodelled:
         }
 
 
-def unmodelled(case: Case, chosen: FilterSetup) -> Unmodelled:
+def unmodelled(case: Case, filter_setup: FilterSetup) -> Unmodelled:
     """Return the evidence against a tuned filter in the part of a record that it was tuned on."""
-    judgement = performance([case], chosen).judgements[0]
+    judgement = performance([case], filter_setup).judgements[0]
     record = record_for_tuning(case)
-    used = of_sensors(chosen, record)
+    used = of_sensors(filter_setup, record)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     if used.gate is not None:
         # A gate removes the tails of the innovations and passes small outliers: NIS and normality are not evidence then.
-        kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
+        kept = tuple(finding for finding in judgement.findings if finding.name not in ("NIS", "normality"))
         judgement = concluded(kept, judgement.limits, PROBABILITY, parts={})
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
@@ -152,7 +154,7 @@ def unmodelled(case: Case, chosen: FilterSetup) -> Unmodelled:
         judgement=judgement,
         scale_factor=scale_factor(setup.modelled_record(record, used), used.process_noise, initial),
         causes=causes,
-        missing=unmodelled_errors(record.origin, chosen),
+        missing=unmodelled_errors(record.origin, filter_setup),
     )
 
 
@@ -162,10 +164,11 @@ MAX_EXAMINED = 4
 
 def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> tuple[Unmodelled, ...]:
     """Return tests of each record for errors that the tuned filter does not model; none if its states model such errors already."""
-    series = [one for case in cases for one in case.record.vectors]
+    series = [vectors for case in cases for vectors in case.record.vectors]
     by_axis = any(  # the search for causes supports one σ per sample only
-        one.anisotropic or (one.kind != "attitude" and isinstance(tuning.setup.sigma.get(one.sensor), tuple))
-        for one in series
+        vectors.anisotropic
+        or (vectors.kind != "attitude" and isinstance(tuning.setup.sigma.get(vectors.sensor), tuple))
+        for vectors in series
     )
     if before.states is not None or by_axis:
         return ()
@@ -183,8 +186,10 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
     """Return a record without the measurements that the gate of an estimate refused."""
     kept = []
     for series in record.vectors:
-        found = estimate.innovations.get(series.sensor)
-        kept.append(series if found is None else series.taken(~np.isin(series.time, found.time[~found.used])))
+        innovations = estimate.innovations.get(series.sensor)
+        kept.append(
+            series if innovations is None else series.taken(~np.isin(series.time, innovations.time[~innovations.used]))
+        )
     return replace(record, vectors=tuple(kept))
 
 
@@ -193,7 +198,7 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
     hypothesis = gyro_error(turns(record, noise, initial), *GYRO_ERRORS[0])
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
     tuned = run(Model(record=record, noise=noise, initial=initial))
-    found = []
+    causes = []
     for level in levels:
         less = replace(noise, rate_random_walk=level * noise.rate_random_walk)
         model = Model(record=record, noise=less, initial=initial)
@@ -201,18 +206,19 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
         cause = by_mean(model, base, hypothesis)
         # The gain of a smaller random walk alone, if it was not tuned, is not due to the scale factor.
         gain = cause.gain + min(base.gain_over(tuned), 0.0) - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))
-        found.append(replace(cause, gain=gain, log_p=min(0.0, log_p(gain, 3) + math.log(len(levels)))))
-    return max(found, key=lambda one: one.gain)
+        causes.append(replace(cause, gain=gain, log_p=min(0.0, log_p(gain, 3) + math.log(len(levels)))))
+    return max(causes, key=lambda cause: cause.gain)
 
 
-def with_misfit_flag(tuning: Tuning, found: Unmodelled) -> Tuning:
+def with_misfit_flag(tuning: Tuning, check: Unmodelled) -> Tuning:
     """Return the tuning with a note on the random walk of the bias if a scale factor explains the innovations better."""
-    if not found.moves_with_the_rate:
+    if not check.moves_with_the_rate:
         return tuning
     doubt = "in doubt: may cover a scale factor of the gyro"
     return replace(
         tuning,
         parameters=tuple(
-            replace(one, note=doubt) if one.name == RRW and one.identified else one for one in tuning.parameters
+            replace(parameter, note=doubt) if parameter.name == RRW and parameter.identified else parameter
+            for parameter in tuning.parameters
         ),
     )

@@ -103,8 +103,10 @@ class Performance:
         known = self.nis_degrees > 0
         typical = max(1, round(float(np.median(self.nis_degrees[known]))))
         nis = np.where(known, self.nis_course, np.nan)
-        found = [("NIS per degree of freedom", self.nis_time, nis, mean_bounds(1, typical, 0.99))]
-        return found + [(f"NEES of the {one.of}, per state", one.time, one.mean, one.bounds) for one in self.nees]
+        courses = [("NIS per degree of freedom", self.nis_time, nis, mean_bounds(1, typical, 0.99))]
+        return courses + [
+            (f"NEES of the {course.of}, per state", course.time, course.mean, course.bounds) for course in self.nees
+        ]
 
     @property
     def row(self) -> tuple[Any, ...]:
@@ -159,18 +161,19 @@ class Comparison(Listed):
         """Return the performance before and after as values for JSON."""
         return {
             name: {
-                "log_likelihood_per_innovation": one.log_likelihood,
-                "nis_per_degree": one.nis,
-                "nis_bounds": one.nis_bounds,
-                "anees_per_state": one.anees,
-                "attitude_rms_rad": one.attitude_rms,
-                "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
+                "log_likelihood_per_innovation": performance.log_likelihood,
+                "nis_per_degree": performance.nis,
+                "nis_bounds": performance.nis_bounds,
+                "anees_per_state": performance.anees,
+                "attitude_rms_rad": performance.attitude_rms,
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in performance.nees},
                 "over_time": [
-                    {"of": of, "time_s": time, "mean": mean, "bounds": bounds} for of, time, mean, bounds in one.courses
+                    {"of": of, "time_s": time, "mean": mean, "bounds": bounds}
+                    for of, time, mean, bounds in performance.courses
                 ],
-                "judgements": [judgement.summary() for judgement in one.judgements],
+                "judgements": [judgement.summary() for judgement in performance.judgements],
             }
-            for name, one in (("before", self.before), ("after", self.after))
+            for name, performance in (("before", self.before), ("after", self.after))
         }
 
     @property
@@ -199,19 +202,19 @@ def compare(cases: Sequence[Case], before: FilterSetup, after: FilterSetup, *, t
         Log likelihood, NIS, NEES and RMS attitude error (rad) of each filter; NaN where the truth needed is unknown.
     """
     with ThreadPoolExecutor(threads) as pool:
-        results = list(pool.map(lambda chosen: performance(cases, chosen), (before, after)))
+        results = list(pool.map(lambda filter_setup: performance(cases, filter_setup), (before, after)))
     return Comparison(before=results[0], after=results[1])
 
 
-def performance(cases: Sequence[Case], chosen: FilterSetup) -> Performance:
+def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance:
     """Return the performance of a filter on the judged part of these cases."""
-    judged = [_judged(case, chosen) for case in cases]
+    judged = [_judged(case, filter_setup) for case in cases]
     total, number, squares = 0.0, 0, 0.0
-    for one in (one for estimate, _ in judged for one in estimate.innovations.values()):
-        e, s = one.innovation[one.used], one.variance[one.used]
+    for innovations in (innovations for estimate, _ in judged for innovations in estimate.innovations.values()):
+        e, s = innovations.innovation[innovations.used], innovations.variance[innovations.used]
         total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * s) + e**2 / s))
         number += e.size
-        squares += float(one.nis[one.used].sum())
+        squares += float(innovations.nis[innovations.used].sum())
     nees, error_squares = [], []
     for estimate, truth in judged:
         if truth is not None and _knows_bias(truth):
@@ -220,8 +223,8 @@ def performance(cases: Sequence[Case], chosen: FilterSetup) -> Performance:
             nees.append(consistency.nees(error, estimate.covariance))
             error_squares.append(np.sum(error[:, :3] ** 2, axis=1))
         elif truth is not None:
-            found = consistency.reference_errors(estimate.attitude, truth.attitude).total
-            error_squares.append(found[np.isfinite(found)] ** 2)
+            errors = consistency.reference_errors(estimate.attitude, truth.attitude).total
+            error_squares.append(errors[np.isfinite(errors)] ** 2)
     time, course, degrees = _nis_course(list(judged[0][0].innovations.values()))
     return Performance(
         log_likelihood=total / number,
@@ -230,7 +233,8 @@ def performance(cases: Sequence[Case], chosen: FilterSetup) -> Performance:
         anees=float(np.mean(np.concatenate(nees)) / 6.0) if nees else float("nan"),
         attitude_rms=float(np.sqrt(np.mean(np.concatenate(error_squares)))) if error_squares else float("nan"),
         judgements=tuple(
-            consistency.judge(one, truth if truth is not None and _knows_bias(truth) else None) for one, truth in judged
+            consistency.judge(estimate, truth if truth is not None and _knows_bias(truth) else None)
+            for estimate, truth in judged
         ),
         nis_time=time,
         nis_course=course,
@@ -243,14 +247,14 @@ def _knows_bias(truth: Truth) -> bool:
     return bool(np.isfinite(truth.bias).any())
 
 
-def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
+def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | None]:
     """Return the judged part of the filter's estimate, with the truth at its times; a reference has no bias."""
-    used = of_sensors(chosen, case.record)
+    used = of_sensors(filter_setup, case.record)
     record = setup.modelled_record(case.record, used)
     truth, reference = record.truth, case.true_attitude
     every = 1 if reference is not None else max(1, len(record.increments) // MAX_ROWS)
     if truth is None and reference is not None:
-        edges = slice(None, None, chosen.integration.samples)
+        edges = slice(None, None, filter_setup.integration.samples)
         attitude = reference[edges][: len(record.time)].copy()
         if case.judged is not None:
             attitude[~case.judged[edges][: len(record.time)]] = np.nan
@@ -261,7 +265,7 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
     def judged(time: Array) -> np.ndarray:
         return (time >= case.first) & (time <= case.last)
 
-    innovations = {name: selected(one, judged(one.time)) for name, one in estimate.innovations.items()}
+    innovations = {name: selected(series, judged(series.time)) for name, series in estimate.innovations.items()}
     inside = judged(estimate.time)
     values = {name: getattr(estimate, name) for name in ("time", "attitude", "bias", "variance", "covariance")}
     part: dict[str, Any] = {name: value[inside] for name, value in values.items() if value is not None}
@@ -278,13 +282,13 @@ def _spans(time: Array, first: float, last: float) -> tuple[Array, np.ndarray]:
 
 
 def _nis_course(innovations: Sequence[Innovations]) -> tuple[Array, Array, Array]:
-    time = np.concatenate([one.time[one.used] for one in innovations])
+    time = np.concatenate([innovation.time[innovation.used] for innovation in innovations])
     middles, places = _spans(time, time.min(), time.max())
     sums, degrees = np.zeros(BINS), np.zeros(BINS)
-    for one in innovations:
-        place, places = places[: one.used.sum()], places[one.used.sum() :]
-        sums += np.bincount(place, one.nis[one.used], BINS)
-        degrees += np.bincount(place, minlength=BINS) * float(one.innovation.shape[1])
+    for part in innovations:
+        place, places = places[: part.used.sum()], places[part.used.sum() :]
+        sums += np.bincount(place, part.nis[part.used], BINS)
+        degrees += np.bincount(place, minlength=BINS) * float(part.innovation.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         return middles, sums / degrees, degrees
 
@@ -300,7 +304,7 @@ def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[NeesCourse, 
     time, P = estimate.time[known], estimate.covariance[known]
     middles, place = _spans(time, time[0], time[-1])
     number = np.bincount(place, minlength=BINS)
-    found = []
+    courses = []
     for name in ("attitude", "bias") if whole else ("attitude",):
         states = consistency.SUBSETS[name]
         # If the bias is known too, the correlation is estimated from all states.
@@ -311,5 +315,5 @@ def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[NeesCourse, 
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(place, consistency.nees(error, P, states), BINS) / (len(states) * number)
-        found.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / BINS))
-    return tuple(found)
+        courses.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / BINS))
+    return tuple(courses)

@@ -40,13 +40,13 @@ def plan(
     if isinstance(setup, Own):
         need_alone(gyro, states)
         setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=False), estimator=setup)
-    chosen = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
-    names = chosen.states.names if setup is None and chosen.states is not None else ()
+    filter_setup = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
+    names = filter_setup.states.names if setup is None and filter_setup.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,
-        setup=chosen,
+        setup=filter_setup,
         seed=scenario.seed if seed is None else seed,
-        epochs=montecarlo.whole_epochs(scenario, chosen),
+        epochs=montecarlo.whole_epochs(scenario, filter_setup),
         individuals=any(not name.endswith((".drift", ".correlated")) for name in names),
         dispersions=dispersions or montecarlo.Dispersions(),
     )
@@ -98,5 +98,5 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    chosen = plan(scenarios.as_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
-    return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
+    campaign = plan(scenarios.as_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    return montecarlo.run_plan(campaign, runs=runs, threads=threads, progress=progress)

@@ -221,17 +221,17 @@ def _run_record(
     """Run the filter over a record; ``changes``: the gate and the weights."""
     if smooth and count("every", every) > 1:
         raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
-    chosen, notes = filter_for_record(record, noise, setup, initial, states)
-    chosen = dataclasses.replace(chosen, **changes)
-    modelled = setups.modelled_record(record, chosen)
+    filter_setup, notes = filter_for_record(record, noise, setup, initial, states)
+    filter_setup = dataclasses.replace(filter_setup, **changes)
+    modelled = setups.modelled_record(record, filter_setup)
     if every > len(modelled.increments):
         raise InputError(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
         )
     if initial is None:
-        begin = for_record.start(modelled, chosen)
+        begin = for_record.start(modelled, filter_setup)
     elif isinstance(initial, str) and initial == "truth":
-        begin = for_record.drawn_start(record, chosen)
+        begin = for_record.drawn_start(record, filter_setup)
     elif isinstance(initial, State):
         begin = for_record.Start(initial, "Started from the state given.")
     else:
@@ -239,7 +239,7 @@ def _run_record(
         if not q.any():
             raise InputError("initial is the zero quaternion; give w, x, y, z of an attitude")
         begin = for_record.Start(
-            setups.initial_state(chosen, quaternion.normalize(q)), "Started from the attitude given."
+            setups.initial_state(filter_setup, quaternion.normalize(q)), "Started from the attitude given."
         )
     if begin.edge > 0:
         modelled = records.cut(modelled, begin.edge, len(modelled.increments))
@@ -249,14 +249,14 @@ def _run_record(
             )
     full = full_covariance is not False
     if smooth:
-        result = setups.smooth_modelled(modelled, chosen, begin.state, full_covariance=full)
+        result = setups.smooth_modelled(modelled, filter_setup, begin.state, full_covariance=full)
     else:
-        result = setups.run_modelled(modelled, chosen, begin.state, every=every, full_covariance=full)
+        result = setups.run_modelled(modelled, filter_setup, begin.state, every=every, full_covariance=full)
     truth = None if modelled.truth is None else modelled.truth.taken(np.searchsorted(modelled.time, result.time))
     result = dataclasses.replace(
-        result, setup=chosen, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words, *notes)
+        result, setup=filter_setup, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words, *notes)
     )
-    return Run(result, modelled, chosen, begin.state)
+    return Run(result, modelled, filter_setup, begin.state)
 
 
 def _run_recording(
@@ -308,7 +308,10 @@ def _run_recording(
         smoothed=smooth,
         remarks=(*remarks(result, motion), *notes),
         details={
-            **{f"parameter.{one.name}": getattr(parameters, one.name) for one in dataclasses.fields(parameters)},
+            **{
+                f"parameter.{parameter.name}": getattr(parameters, parameter.name)
+                for parameter in dataclasses.fields(parameters)
+            },
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
         },

@@ -75,8 +75,8 @@ def read(
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
-    given = {"units": units, "columns": columns, "topic": topic, "axes": axes, "invert": invert}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value}
+    declared = {"units": units, "columns": columns, "topic": topic, "axes": axes, "invert": invert}
+    options: dict[str, Any] = {name: value for name, value in declared.items() if value}
     if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
         if topic:
             raise InputError(f"{Hint('topic')} is for a bag or a flight log; leave it out")

@@ -84,7 +84,11 @@ def need_alone(noise: Any, states: Any) -> None:
 
 def need_angles(setup: FilterSetup, record: ImuRecord) -> None:
     """Raise an error for σ of the record's sensors that cannot be in rad, unless the record's own are as large."""
-    fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
+    fine = {
+        vectors.sensor: vectors.kind
+        for vectors in record.vectors
+        if len(vectors.time) and np.max(vectors.sigma) <= np.pi
+    }
     setups.need_angles(setup, fine, "filter")
 
 
@@ -92,22 +96,22 @@ def matched_filter(
     record: ImuRecord, spec: GyroSpec | None = None, *, states: bool | Sequence[str] | None = None
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter that matches a record's specifications, and remarks on its error states and on errors without one."""
-    chosen = setups.FilterSetup.for_record(record, spec, states=states)
-    missing = for_record.unmodelled_errors(record.origin, chosen)
-    if states is False or (states is None and chosen.states is None):
-        return chosen, no_state_words(missing, chosen)
+    filter_setup = setups.FilterSetup.for_record(record, spec, states=states)
+    missing = for_record.unmodelled_errors(record.origin, filter_setup)
+    if states is False or (states is None and filter_setup.states is None):
+        return filter_setup, no_state_words(missing, filter_setup)
     notes = []
     if record.origin is None or record.origin.scenario is None:
         notes.append(
             "The record does not contain its scenario, so the errors of its sensors are unknown: no state for them."
         )
-    if chosen.states is None:
+    if filter_setup.states is None:
         notes.append("No errors are specified that need optional states; the filter has none.")
     elif states is None:
-        notes.append(state_words(chosen.states.names))
+        notes.append(state_words(filter_setup.states.names))
     else:
-        notes.append(f"Optional states: {', '.join(chosen.states.names)}.")
-    return chosen, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+        notes.append(f"Optional states: {', '.join(filter_setup.states.names)}.")
+    return filter_setup, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
 
 
 def filter_for_scenario(
@@ -136,8 +140,8 @@ def state_words(names: Sequence[str]) -> str:
     )
 
 
-def no_state_words(missing: Sequence[str], chosen: FilterSetup) -> list[str]:
+def no_state_words(missing: Sequence[str], filter_setup: FilterSetup) -> list[str]:
     """Return a message about errors for which a filter has no state, with a remedy; empty if there are none."""
-    remedy = "" if chosen.states is not None else f"; {Hint('states', True)} adds states for most of them"
+    remedy = "" if filter_setup.states is not None else f"; {Hint('states', True)} adds states for most of them"
     said = f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."
     return [said] if missing else []

@@ -57,7 +57,7 @@ def integrate(
     >>> import strapdown as sd
     >>> found = sd.integrate(sd.simulate("coning"))  # doctest: +SKIP
     """
-    chosen = coning.named(algorithm)
+    rule = coning.named(algorithm)
     instance("source", source, (ImuRecord, Recording), SOURCE)
     if isinstance(source, ImuRecord):
         time, increments = source.time, source.increments
@@ -65,9 +65,9 @@ def integrate(
     else:
         place = source.source
         time, increments, known = source.time, recordings.increments(source), source.true_attitude
-    if len(increments) < chosen.samples:
+    if len(increments) < rule.samples:
         raise InputError(
-            f"{place} holds {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; choose another "
+            f"{place} holds {len(increments)} gyro samples, fewer than the {rule.samples} of one step of {rule.name}; choose another "
             "algorithm or a longer recording"
         )
     start: ArrayLike = quaternion.IDENTITY
@@ -75,5 +75,5 @@ def integrate(
         start = initial_attitude
     elif known is not None and np.isfinite(known[0]).all():
         start = known[0]
-    attitude = coning.integrate(increments, chosen, start, edges=time)
-    return AttitudeHistory(time[: len(attitude) * chosen.samples : chosen.samples], attitude)
+    attitude = coning.integrate(increments, rule, start, edges=time)
+    return AttitudeHistory(time[: len(attitude) * rule.samples : rule.samples], attitude)

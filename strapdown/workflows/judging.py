@@ -109,28 +109,28 @@ def diagnose(
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
-    chosen = result.setup if setup is None else setup
-    if chosen is None:
+    filter_setup = result.setup if setup is None else setup
+    if filter_setup is None:
         raise InputError(f"the estimate does not contain its filter; give it, {Hint('setup')}")
     unknown = sorted(set(result.innovations) - {series.sensor for series in record.vectors})
     if unknown or not np.isin(result.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
         raise InputError(f"the record {what}; the estimate was made from another record")
-    if chosen.states is not None and chosen.states.names:
-        names = ", ".join(chosen.states.names)
+    if filter_setup.states is not None and filter_setup.states.names:
+        names = ", ".join(filter_setup.states.names)
         return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
     P = np.diag(result.variance[0]) if result.covariance is None else result.covariance[0]
     initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
     judged = judgement or check(result)
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
-    found = diagnosis.diagnose(
-        accepted(record, result), chosen, initial, probability=judged.confidence_level, judgement=judged
+    causes = diagnosis.diagnose(
+        accepted(record, result), filter_setup, initial, probability=judged.confidence_level, judgement=judged
     )
-    if chosen.robust is not None:
-        return found, "The filter weights measurements by their innovations, and the search for causes does not"
+    if filter_setup.robust is not None:
+        return causes, "The filter weights measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in result.events):
-        return found, "The filter recovered from a lost attitude, and the search for causes does not"
-    return found, ""
+        return causes, "The filter recovered from a lost attitude, and the search for causes does not"
+    return causes, ""
 
 
 def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes | None = None) -> Accuracy:

@@ -78,11 +78,11 @@ def tune(
     >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
     """
     options = locals()
-    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
-    result = tuned(**{**options, "sources": given})
-    for one in given:
-        if isinstance(one, Recording):
-            warn_about_conventions(one)
+    listed = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
+    result = tuned(**{**options, "sources": listed})
+    for source in listed:
+        if isinstance(source, Recording):
+            warn_about_conventions(source)
     return result.tuning
 
 
@@ -105,27 +105,27 @@ def tuned(
         raise InputError("sources is empty; give at least one record or recording")
     labels = list(names) or [f"record {k}" if len(sources) > 1 else "" for k in range(len(sources))]
     own, cases = setup is not None, []
-    for one, label in zip(sources, labels, strict=True):
-        instance("sources", one, (ImuRecord, Recording), SOURCE)
-        if isinstance(one, ImuRecord):
+    for source, label in zip(sources, labels, strict=True):
+        instance("sources", source, (ImuRecord, Recording), SOURCE)
+        if isinstance(source, ImuRecord):
             if setup is None:
-                if one.origin is None or one.origin.gyro is None:
+                if source.origin is None or source.origin.gyro is None:
                     raise InputError(
                         f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
                     )
-                setup = setups.FilterSetup.for_record(one, states=states)
+                setup = setups.FilterSetup.for_record(source, states=states)
             elif own and states:
                 if setup.states is not None:
                     raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
-                added = setups.FilterSetup.for_record(one, states=True).states
+                added = setups.FilterSetup.for_record(source, states=True).states
                 setup, states = dataclasses.replace(setup, states=added), None
-            need_angles(setup, one)
-            cases.append(tuning.record_case(one, setup, name=label))
+            need_angles(setup, source)
+            cases.append(tuning.record_case(source, setup, name=label))
         else:
             setup = setup or tuning.recording_setup()
-            cases.append(tuning.recording_case(one))
+            cases.append(tuning.recording_case(source))
     assert setup is not None
-    if not (options.get("truth") or all(isinstance(one, ImuRecord) for one in sources)):
+    if not (options.get("truth") or all(isinstance(source, ImuRecord) for source in sources)):
         free, options["spacing"] = tuning.by_innovations(
             free, options.get("spacing", 0.0), gate=options.get("gate"), priors=priors
         )
@@ -134,7 +134,9 @@ def tuned(
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         specified = (
-            (label, one.origin) for label, one in zip(labels, sources, strict=True) if isinstance(one, ImuRecord)
+            (label, source.origin)
+            for label, source in zip(labels, sources, strict=True)
+            if isinstance(source, ImuRecord)
         )
         tuning.one_gyro(
             {label: origin.gyro for label, origin in specified if origin is not None and origin.gyro is not None}

@@ -124,23 +124,23 @@ def compare(
     InputError
         If a name is unknown, or ``filters`` is empty.
     """
-    chosen = [
-        one if isinstance(one, str) else as_own(one) for one in ([filters] if isinstance(filters, str) else filters)
+    estimators = [
+        name if isinstance(name, str) else as_own(name) for name in ([filters] if isinstance(filters, str) else filters)
     ]
-    if not chosen:
+    if not estimators:
         raise InputError(f"filters is empty; name at least one of {', '.join(FILTERS)}")
-    for one in chosen:
-        if isinstance(one, str):
-            one_of("filter", one, FILTERS)
-    names = [one if isinstance(one, str) else one.name for one in chosen]
+    for estimator in estimators:
+        if isinstance(estimator, str):
+            one_of("filter", estimator, FILTERS)
+    names = [estimator if isinstance(estimator, str) else estimator.name for estimator in estimators]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InputError(f"filters has two of the name {min(twice)}; give yours another one by an attribute `name`")
     estimates = {
-        name: one(record, initial, times=record.time[::every])
-        if isinstance(one, Own)
-        else run(one, record, process_noise, initial, every=every, full_covariance=full_covariance)
-        for name, one in zip(names, chosen, strict=True)
+        name: estimator(record, initial, times=record.time[::every])
+        if isinstance(estimator, Own)
+        else run(estimator, record, process_noise, initial, every=every, full_covariance=full_covariance)
+        for name, estimator in zip(names, estimators, strict=True)
     }
     truth = record.truth
     if bound is not None and truth is None:

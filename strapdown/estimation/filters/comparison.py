@@ -62,9 +62,9 @@ class Comparison(Listed):
     def listing(self) -> Table:
         """Return errors and the filter's σ, which should agree, as a table."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
-        found = self.summary()
+        summary = self.summary()
         rows: list[tuple[Any, ...]] = []
-        for name, row in found.items():
+        for name, row in summary.items():
             itself = self.truth is None and not rows  # no difference to report
             bias, bias_sigma = row["bias_error"] / DEGREE_PER_HOUR, row["bias_sigma"] / DEGREE_PER_HOUR
             angle = None if itself else row["attitude_error"] / DEGREE
@@ -79,7 +79,7 @@ class Comparison(Listed):
             notes.append(
                 "error/√bound: error over the root of the Cramér–Rao bound, about 1 on average for an efficient filter."
             )
-        if degrees := max(row["degrees"] for row in found.values()):
+        if degrees := max(row["degrees"] for row in summary.values()):
             notes.append(
                 f"NIS per degree of freedom: 1 ± {2.0 * math.sqrt(2.0 / degrees):.3f} for a consistent filter."
             )

@@ -77,7 +77,7 @@ def run(
     count("every", every)
     problem = forward.with_any_sensor(forward.prepared(record, process_noise, initial, ()))
     events = problem.events
-    chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
+    used = _steady_gains(record, events, process_noise, initial) if gains is None else gains
     rows = len(record.increments) // every + 1
     shapes = (
         (rows, 7),
@@ -92,7 +92,7 @@ def run(
     body = complementary.Body(
         form=forward.filter_body(problem, {}),
         options=forward.gate_options(None, None)._replace(thresholds=np.full(3, -1.0)),
-        gains=array("gains", chosen, (2, len(events.sensors))),
+        gains=array("gains", used, (2, len(events.sensors))),
         room=np.empty((2, 6, 6)),
     )
     measured, kernels = forward.measurements_in_body_axes(events), forward.instance_of(problem.model)

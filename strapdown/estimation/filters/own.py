@@ -208,29 +208,30 @@ def read_filter(place: str | os.PathLike[str]) -> Own:
     )
 
 
-def _function(given: Any) -> Any:
+def _function(estimator: Any) -> Any:
     """Return the function to call: the method ``run`` of an object that has one, else the object itself."""
-    if isinstance(given, type):
-        raise InputError(f"{given.__name__} is a class; give an object of it, {given.__name__}(…)")
-    function = getattr(given, "run", given)
+    if isinstance(estimator, type):
+        raise InputError(f"{estimator.__name__} is a class; give an object of it, {estimator.__name__}(…)")
+    function = getattr(estimator, "run", estimator)
     if not callable(function):
         raise InputError(
-            f"{given!r} is no filter; give a function of (record, initial) that returns an Estimate, or an object with such a method run"
+            f"{estimator!r} is no filter; give a function of (record, initial) that returns an Estimate, or an object with such a "
+            "method run"
         )
     try:
         inspect.signature(function).bind(None, None)
     except TypeError:
         raise InputError(
-            f"{getattr(function, '__qualname__', given)} cannot be called with (record, initial); give it these two arguments"
+            f"{getattr(function, '__qualname__', estimator)} cannot be called with (record, initial); give it these two arguments"
         ) from None
     except ValueError:  # a compiled function without a signature
         pass
     return function
 
 
-def _copied(given: Any, name: str) -> Any:
+def _copied(estimator: Any, name: str) -> Any:
     try:
-        return copy.deepcopy(given)  # functions are returned unchanged
+        return copy.deepcopy(estimator)  # functions are returned unchanged
     except Exception as error:
         raise InputError(
             f"{name} cannot be copied for each run ({error}); give a function that creates the parts that cannot be copied"
@@ -267,9 +268,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): _plain(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     return getattr(value, "__qualname__", None) or ("none" if value is None else type(value).__qualname__)

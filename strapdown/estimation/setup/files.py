@@ -61,34 +61,34 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
 def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     """Return the setup in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
-    given = {name: table[name] for name in _PARTS if name in table}
+    sections = {name: table[name] for name in _PARTS if name in table}
     for name in ("sigma", "gate", "robust", "states"):
-        if name in given:
-            given[name] = tables.subtable(given[name], f"{place}: {name}", f", [{place}.{name}]")
+        if name in sections:
+            sections[name] = tables.subtable(sections[name], f"{place}: {name}", f", [{place}.{name}]")
     noise = {key: table[key] for key in tables.keys(_NOISE_FORM) if key in table}
     parts: dict[str, Any] = {}
-    if "integration" in given:
-        algorithm = given["integration"]
+    if "integration" in sections:
+        algorithm = sections["integration"]
         if isinstance(algorithm, Mapping):
             parts["integration"] = coning.Algorithm.from_table(algorithm, f"{place}: integration")
         else:
             parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", algorithm, coning.ALGORITHMS)]
-    if "sigma" in given:
-        parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", s) for name, s in given["sigma"].items()}
-    if "gate" in given:
-        never = {"recovery": None} if given["gate"].get("recovery") == NO_RECOVERY else {}
-        gate = {key: value for key, value in given["gate"].items() if key not in never}
+    if "sigma" in sections:
+        parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", s) for name, s in sections["sigma"].items()}
+    if "gate" in sections:
+        never = {"recovery": None} if sections["gate"].get("recovery") == NO_RECOVERY else {}
+        gate = {key: value for key, value in sections["gate"].items() if key not in never}
         parts["gate"] = tables.build(Gate, gate, _GATE_FORM, f"{place}: gate", **never)
-    if "robust" in given:
-        parts["robust"] = tables.build(Robust, given["robust"], _ROBUST_FORM, f"{place}: robust")
-    if "states" in given:
-        parts["states"] = optional.from_table(given["states"], f"{place}: states")
-    if "estimator" in given:
-        estimator = given["estimator"]  # a table describes a user's filter, whose code is in no file
+    if "robust" in sections:
+        parts["robust"] = tables.build(Robust, sections["robust"], _ROBUST_FORM, f"{place}: robust")
+    if "states" in sections:
+        parts["states"] = optional.from_table(sections["states"], f"{place}: states")
+    if "estimator" in sections:
+        estimator = sections["estimator"]  # a table describes a user's filter, whose code is in no file
         own = isinstance(estimator, Mapping) and "name" in estimator
         parts["estimator"] = Own(estimator) if own else str(estimator)
     parts["process_noise"] = tables.build(ProcessNoise, noise, _NOISE_FORM, place)
-    rest = {key: value for key, value in table.items() if key not in {*noise, *given}}
+    rest = {key: value for key, value in table.items() if key not in {*noise, *sections}}
     return tables.build(FilterSetup, rest, _FORM, place, **parts)  # type: ignore[no-any-return]
 
 

@@ -38,7 +38,7 @@ def sensor_sigma(name: str, value: Any) -> Sigma:
         return positive(name, value)
     if len(value) != 3:
         raise InputError(f"{name} has {len(value)} numbers; give one, or three for the body axes x, y, z")
-    x, y, z = (positive(f"{name}: {axis}", one) for axis, one in zip("xyz", value, strict=True))
+    x, y, z = (positive(f"{name}: {axis}", sigma) for axis, sigma in zip("xyz", value, strict=True))
     return x, y, z
 
 

@@ -21,12 +21,12 @@ UNEVEN = 2.0
 REMEDY = f"give the initial attitude, {Hint('initial')}"
 
 
-def unmodelled_errors(origin: Origin | None, chosen: FilterSetup | None) -> tuple[str, ...]:
+def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -> tuple[str, ...]:
     """Return, as texts, the errors that an origin specifies and a filter has no state for; empty if nothing is specified."""
-    if origin is None or origin.gyro is None or chosen is None:
+    if origin is None or origin.gyro is None or filter_setup is None:
         return ()
     sensors, gravity_f = setup.specified(origin)
-    return setup.unmodelled_errors(origin.gyro, sensors, chosen.states, gravity_f=gravity_f)
+    return setup.unmodelled_errors(origin.gyro, sensors, filter_setup.states, gravity_f=gravity_f)
 
 
 class Start(NamedTuple):
@@ -39,7 +39,7 @@ class Start(NamedTuple):
     """Edge of the filter's steps at which the filter starts."""
 
 
-def start(record: ImuRecord, chosen: FilterSetup) -> Start:
+def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
     """Return the initial state from the first measurements of a record.
 
     Their noise is that of the filter (:func:`strapdown.estimation.setup.modelled_record`). If one set of measurements does not determine
@@ -47,18 +47,18 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where its hypotheses are merged into one.
     """
     try:
-        state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        state = estimation.first_state(record, filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma)
     except InconsistentError as error:
         problem = _without_remedy(error)
         # With a sensor's errors among the states, the filter can estimate them.
-        if chosen.states is None:
+        if filter_setup.states is None:
             raise InputError(
                 f"{problem}; if a sensor has a bias, give the filter its state, {Hint('states', True)}; or {REMEDY}"
             ) from None
-        return _by_multiple_models(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}")
+        return _by_multiple_models(record, filter_setup, problem, f"{problem[:1].upper()}{problem[1:]}")
     except InputError as error:
         return _by_multiple_models(
-            record, chosen, _without_remedy(error), "One direction at a time does not determine the attitude"
+            record, filter_setup, _without_remedy(error), "One direction at a time does not determine the attitude"
         )
     return Start(state, f"Started from the first measurements, σ {_sigma_words(state)}.")
 
@@ -67,26 +67,26 @@ def _without_remedy(error: InputError) -> str:
     return str(error).removesuffix("; give the initial attitude")
 
 
-def _by_multiple_models(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> Start:
+def _by_multiple_models(record: ImuRecord, filter_setup: FilterSetup, problem: str, why: str) -> Start:
     """Return the state of a bank of filters at which its hypotheses are merged into one."""
     try:
-        found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        bank = multiple_model.run(record, filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma)
     except InputError as error:
         raise InputError(f"{problem}; a bank of hypotheses does not find it either ({error}); {REMEDY}") from None
-    if not found.converged:
-        raise InputError(f"{problem}; a bank of hypotheses does not find it either: {found.reason}; or {REMEDY}")
-    edge = int(np.searchsorted(record.time, found.became_one))
+    if not bank.converged:
+        raise InputError(f"{problem}; a bank of hypotheses does not find it either: {bank.reason}; or {REMEDY}")
+    edge = int(np.searchsorted(record.time, bank.became_one))
     if edge >= len(record.increments):
         raise InputError(f"{problem}, and a bank of hypotheses found it only at the end; record longer, or {REMEDY}")
-    row = int(np.searchsorted(found.estimate.time, found.became_one))
-    assert found.estimate.covariance is not None
+    row = int(np.searchsorted(bank.estimate.time, bank.became_one))
+    assert bank.estimate.covariance is not None
     state = State(
-        attitude=found.estimate.attitude[row],
-        bias=found.estimate.bias[row],
-        covariance=found.estimate.covariance[row],
+        attitude=bank.estimate.attitude[row],
+        bias=bank.estimate.bias[row],
+        covariance=bank.estimate.covariance[row],
     )
     words = (
-        f"{why}: {len(found.angles)} hypotheses were merged into one at {found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
+        f"{why}: {len(bank.angles)} hypotheses were merged into one at {bank.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
         "begins there."
     )
     return Start(state, words, edge)
@@ -100,10 +100,10 @@ def _sigma_words(state: State) -> str:
     return f"{least:.3g} to {most:.3g}° by direction"
 
 
-def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
+def drawn_start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
     """Return the true initial state with errors drawn from the setup's σ, by seed and run of the record's ``origin``."""
     if record.truth is None:
         raise InputError("a start drawn about the truth needs a record with its truth; this one has none")
     origin = record.origin or Origin()
     words = "Started from the truth with errors drawn from the filter's σ."
-    return Start(setup.drawn_state(chosen, record, origin.seed or 0, origin.run or 0), words)
+    return Start(setup.drawn_state(filter_setup, record, origin.seed or 0, origin.run or 0), words)

@@ -47,13 +47,13 @@ def matched(
     """
     drift_sigma, drift_time, fast, white = _drifts(spec, record, density)
     force = np.abs(spec.g_sensitivity) if np.any(gravity_f) else np.zeros((3, 3))
-    series = {one.sensor: one for one in record.vectors}
-    found = {}
+    series = {vectors.sensor: vectors for vectors in record.vectors}
+    matched_sensors = {}
     for sensor in sensors:
         if sensor.name in series and len(series[sensor.name].time):
             own = _of_sensor(sensor, series[sensor.name])
             if own != SensorStates():
-                found[sensor.name] = own
+                matched_sensors[sensor.name] = own
     states = States(
         gyro_scale_sigma=_entries(np.abs(spec.scale_factor)),
         gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
@@ -64,7 +64,7 @@ def matched(
         gyro_drift_time=drift_time,
         gyro_fast_bias_sigma=fast,
         gravity_f=tuple(gravity_f) if np.any(gravity_f) else vectors.GRAVITY_F,
-        sensors=found,
+        sensors=matched_sensors,
     )
     return states, white
 
@@ -169,12 +169,12 @@ def noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
     walk = np.max(np.square(spec.rate_random_walk))
     if not np.isfinite(spec.markov_correlation_time):
         walk = np.max(np.square(spec.rate_random_walk) + np.square(spec.markov_noise))
-    found = {
+    densities = {
         "angle_random_walk": float(np.sqrt(np.max(np.square(spec.angle_random_walk)) + white)),
         "rate_random_walk": float(np.sqrt(walk)),
     }
-    _need_white(found)
-    return found
+    _need_white(densities)
+    return densities
 
 
 def commutes_badly(record: ImuRecord, white: float) -> bool:
@@ -182,10 +182,10 @@ def commutes_badly(record: ImuRecord, white: float) -> bool:
     better = coning.ALGORITHMS[ACCURATE_ALGORITHM]
     if len(record.increments) < MIN_SAMPLES:
         return False
-    one = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
+    one_sample = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
     other = coning.integrate(record.increments, better, edges=record.time)[-1]
     length = float(record.time[-1] - record.time[0])
-    drift = float(np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(one), other)))) / length
+    drift = float(np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(one_sample), other)))) / length
     return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
 
 
@@ -211,7 +211,7 @@ def unmodelled_errors(
         float(np.max(np.abs(getattr(spec, name))))
         for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability")
     )
-    found: list[tuple[Any, str, str]] = [
+    terms: list[tuple[Any, str, str]] = [
         (scale, "gyro.scale", f"the gyro's scale factor of {scale / 1e-6:.3g} ppm"),
         (asymmetry, "", f"the gyro's asymmetry of {asymmetry / 1e-6:.3g} ppm"),
         (misalignment, "gyro.misalignment", f"the gyro's misalignment of {misalignment / 1e-3:.3g} mrad"),
@@ -227,7 +227,7 @@ def unmodelled_errors(
     for sensor in sensors:
         name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
         accelerated = getattr(sensor, "acceleration_f", None) is not None
-        found += [
+        terms += [
             (getattr(sensor, "hard_iron", 0.0), f"{name}.bias", f"the hard iron of the {name}"),
             (getattr(sensor, "soft_iron", 0.0), "", f"the soft iron of the {name}"),
             (getattr(sensor, "bias", 0.0), f"{name}.bias", f"the bias of the {name}"),
@@ -241,7 +241,7 @@ def unmodelled_errors(
             (faults.outlier_probability, "", f"the outliers of the {name}"),
         ]
     known = () if states is None else states.names
-    return tuple(words for size, state, words in found if np.any(size) and state not in known)
+    return tuple(words for size, state, words in terms if np.any(size) and state not in known)
 
 
 def linear_sigma(record: ImuRecord) -> float:
@@ -261,17 +261,17 @@ def noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
     """Return the two noises of a filter without drifts as states; flicker is matched to the record's measurements, or its duration."""
     density = measurement_density(record)
     if not np.any(np.asarray(spec.bias_instability) > 0.0):
-        found = gyro.process_noise(spec)
+        densities = gyro.process_noise(spec)
     elif np.isfinite(density):
-        found = gyro.matched_process_noise(spec, density)
+        densities = gyro.matched_process_noise(spec, density)
     else:
-        found = gyro.process_noise(spec, bandwidth=2.0 * np.pi / float(record.time[-1] - record.time[0]))
-    _need_white(found)
-    return found
+        densities = gyro.process_noise(spec, bandwidth=2.0 * np.pi / float(record.time[-1] - record.time[0]))
+    _need_white(densities)
+    return densities
 
 
-def _need_white(found: Mapping[str, float]) -> None:
-    if found["angle_random_walk"] == 0.0:
+def _need_white(densities: Mapping[str, float]) -> None:
+    if densities["angle_random_walk"] == 0.0:
         raise InputError(
             "the gyro's specification has no angle random walk, but a filter needs one greater than zero; "
             "give it, or a filter setup"
@@ -290,7 +290,7 @@ def _information(series: VectorMeasurements) -> float:
     if series.attitude is not None:
         assert series.sigma_axes is not None
         return float(np.sum(series.sigma_axes**-2.0)) / 3.0
-    seen = np.isfinite(series.vector_b).all(axis=1)
+    known = np.isfinite(series.vector_b).all(axis=1)
     length = np.linalg.norm(series.references_f, axis=1) if series.kind == "vector" else np.ones(len(series.time))
     share = 1.0 / 3.0 if series.kind == "heading" else 2.0 / 3.0
-    return share * float(np.sum((length[seen] / series.sigma[seen]) ** 2))
+    return share * float(np.sum((length[known] / series.sigma[known]) ** 2))

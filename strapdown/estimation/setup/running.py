@@ -55,30 +55,30 @@ def with_sigma(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
 def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
     factor = setup.measurement_sigma_factor
     if series.sensor in setup.sigma:
-        given = setup.sigma[series.sensor]
-        if isinstance(given, tuple):
-            return _by_axis(series, given, factor)
+        sigma = setup.sigma[series.sensor]
+        if isinstance(sigma, tuple):
+            return _by_axis(series, sigma, factor)
         own = float(np.sqrt(np.mean(series.sigma**2))) if len(series.time) else 0.0
         if own == 0.0:
             if series.attitude is not None:
-                return replace(series, sigma_axes=np.full(3, factor * given))
-            return replace(series, sigma=np.full(len(series.time), factor * given))
-        factor *= given / own
+                return replace(series, sigma_axes=np.full(3, factor * sigma))
+            return replace(series, sigma=np.full(len(series.time), factor * sigma))
+        factor *= sigma / own
     return series if factor == 1.0 else series.noise_scaled(factor)
 
 
-def _by_axis(series: VectorMeasurements, given: tuple[float, float, float], factor: float) -> VectorMeasurements:
+def _by_axis(series: VectorMeasurements, sigma: tuple[float, float, float], factor: float) -> VectorMeasurements:
     """Return the series with a separate σ about each body axis, whose ratios between samples are those of the series."""
     if series.kind == "heading":
         raise InputError(
-            f"sigma: {series.sensor} is {given}, three numbers, but a heading has one degree of freedom; give one number"
+            f"sigma: {series.sensor} is {sigma}, three numbers, but a heading has one degree of freedom; give one number"
         )
     m = len(series.time)
     own = float(np.sqrt(np.mean(series.sigma**2))) if m else 0.0
     level = series.sigma / own if own > 0.0 else np.ones(m)
     # sigma is recomputed as the root mean square over the axes.
     return replace(
-        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(given)[None], covariance=None
+        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(sigma)[None], covariance=None
     )
 
 
@@ -116,11 +116,13 @@ def run_modelled(
     """Run the filter of a setup over a :func:`modelled_record`, with its :func:`measured_motion` if known."""
     if setup.estimator != MEKF:
         return _run_other(record, setup, initial, **options)
-    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    judging = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is None:
-        return estimation.run(record, setup.process_noise, initial, **chosen)
+        return estimation.run(record, setup.process_noise, initial, **judging)
     problem = replace(prepared(record, setup, initial), motion=motion)
-    return _reported(forward.filtered(problem, forward.Options(**chosen, **WHOLE_BIAS)).estimate, setup.states, initial)
+    return _reported(
+        forward.filtered(problem, forward.Options(**judging, **WHOLE_BIAS)).estimate, setup.states, initial
+    )
 
 
 def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array] | None:
@@ -129,7 +131,7 @@ def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array
     None if the setup has no lever arm, or runs in segments of constant temperature.
     """
     states = setup.states or States()
-    levers = any(np.any(one.lever_arm_sigma) for one in states.sensors.values())
+    levers = any(np.any(sensor.lever_arm_sigma) for sensor in states.sensors.values())
     if not levers or np.any(states.gyro_temperature_sigma):
         return None
     return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
@@ -171,10 +173,10 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
     """Run the smoother of a setup over a :func:`modelled_record`."""
     need_mekf(setup, "the smoother")
-    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    judging = {"gate": setup.gate, "robust": setup.robust, **options}
     states = setup.states or States()
     blocks = _blocks(record, states)
-    n = 6 + sum(one.size for one in blocks)
+    n = 6 + sum(block.size for block in blocks)
     segments = len(record.increments) + sum(len(series.time) for series in record.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
     if states.gyro_drift_sigma:
@@ -185,21 +187,22 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
             "cut the record, or do not smooth"
         )
     if not states.gyro_drift_sigma:
-        return estimation.smooth(record, setup.process_noise, initial, blocks, **chosen)
+        return estimation.smooth(record, setup.process_noise, initial, blocks, **judging)
     start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
-    full, of_all = bool(chosen.pop("full_covariance", False)), bool(chosen.pop("error_state_covariance", True))
-    found = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **chosen)
-    assert found.whole_covariance is not None
+    full, of_all = bool(judging.pop("full_covariance", False)), bool(judging.pop("error_state_covariance", True))
+    smoothed = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **judging)
+    assert smoothed.whole_covariance is not None
     offsets = _offsets(blocks)
     sums = np.eye(6, 6 + offsets.shape[1])
     sums[3:, 6:] = offsets
-    covariance = sums @ found.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
+    covariance = sums @ smoothed.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
     return replace(
-        found,
-        bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
+        smoothed,
+        bias=smoothed.bias
+        + np.concatenate([block.values for block in smoothed.error_states.values()], axis=1) @ offsets.T,
         variance=np.einsum("kii->ki", covariance).copy(),
         covariance=covariance if full else None,
-        whole_covariance=found.whole_covariance if full and of_all else None,
+        whole_covariance=smoothed.whole_covariance if full and of_all else None,
     )
 
 
@@ -276,7 +279,7 @@ def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], f
 
 def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
     """Return the contribution of a unit of each error state to the gyro's bias (3, m)."""
-    return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
+    return np.concatenate([np.empty((3, 0)), *(np.asarray(block.gyro_offset).T for block in error_states)], axis=1)
 
 
 def _blocks(record: ImuRecord, states: States) -> tuple[ErrorStates, ...]:
@@ -292,12 +295,12 @@ def prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.P
     return forward.prepared(record, setup.process_noise, start, blocks, driven=True)
 
 
-def _reported(found: Estimate, states: States, initial: State) -> Estimate:
+def _reported(estimate: Estimate, states: States, initial: State) -> Estimate:
     """Return an estimate of the whole bias whose variance includes the part with a bandwidth above that of the states."""
-    fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
+    fast = np.outer(np.ones(len(estimate.time)), _BIAS * states.gyro_fast_bias_sigma**2)
     if not len(initial.values):
         fast[0] *= -1.0  # the initial bias contains this part, so its error does not
-    P = found.covariance
+    P = estimate.covariance
     return replace(
-        found, variance=found.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)
+        estimate, variance=estimate.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)
     )

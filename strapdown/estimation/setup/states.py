@@ -129,25 +129,25 @@ class SensorStates:
             self._velocity("accelerometer", 1.0)
 
     def _velocity(self, sensor: str, strength: float) -> BoundedVelocity:
-        given = {name: getattr(self, name) for name in VELOCITY}
-        return BoundedVelocity(sensor=sensor, strength=strength, **given)
+        motion = {name: getattr(self, name) for name in VELOCITY}
+        return BoundedVelocity(sensor=sensor, strength=strength, **motion)
 
     def _blocks(self, sensor: str, kind: str, gravity: float) -> list[ErrorStates]:
         """Return the error states of a sensor whose measurements are of this kind; a direction's specific force is divided by gravity."""
         one_of(f"{sensor}: kind", kind, KINDS)
         strength = 1.0 if kind == "vector" else gravity
-        found: list[ErrorStates] = []
+        blocks: list[ErrorStates] = []
         if _any(self.mounting_sigma):
-            found.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
+            blocks.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
         if _any(self.bias_sigma):
             # Only beside a velocity is the vector known to be a specific force.
             unit = "m/s²" if kind == "vector" and self.velocity_time > 0.0 else "1"
             bias_sigma = np.asarray(self.bias_sigma)
-            found.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
+            blocks.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
         if _any(self.lever_arm_sigma):
-            found.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
+            blocks.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
         if self.correlated_sigma > 0.0:
-            found.append(
+            blocks.append(
                 GaussMarkov(
                     sensor=sensor,
                     noise_sigma=self.correlated_sigma,
@@ -158,8 +158,8 @@ class SensorStates:
             )
         if self.velocity_time > 0.0:
             one_of(f"{sensor}: velocity_time needs an accelerometer; kind", kind, ("direction", "vector"))
-            found.append(self._velocity(sensor, strength))
-        return found
+            blocks.append(self._velocity(sensor, strength))
+        return blocks
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,26 +225,26 @@ class States(ByValue):
         non_negative("gyro_fast_bias_sigma", self.gyro_fast_bias_sigma, unit="rad/s")
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         object.__setattr__(self, "sensors", dict(self.sensors))
-        for name, one in self.sensors.items():
-            if not isinstance(one, SensorStates):
-                raise InputError(f"sensors[{name!r}] is {one!r}; it must be SensorStates")
+        for name, states in self.sensors.items():
+            if not isinstance(states, SensorStates):
+                raise InputError(f"sensors[{name!r}] is {states!r}; it must be SensorStates")
         self._gyro_blocks()
 
     def _gyro_blocks(self) -> list[ErrorStates]:
         """Return the error states of the gyro whose σ is above zero."""
-        found: list[ErrorStates] = []
+        blocks: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
             scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
-            found.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
+            blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
         if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
             along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
-            found.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
+            blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
         if _any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
             slope = _spread(self.gyro_temperature_sigma, 0.0)[0]
-            found.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
+            blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
-            found.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
-        return found
+            blocks.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
+        return blocks
 
     def blocks(self, kinds: Mapping[str, str]) -> tuple[ErrorStates, ...]:
         """Return all error states of a filter.
@@ -259,19 +259,19 @@ class States(ByValue):
         tuple of ErrorStates
             Declarations of the gyro, then those of the sensors in the order of ``sensors``.
         """
-        found, gravity = self._gyro_blocks(), float(np.linalg.norm(self.gravity_f))
-        for name, one in self.sensors.items():
+        blocks, gravity = self._gyro_blocks(), float(np.linalg.norm(self.gravity_f))
+        for name, states in self.sensors.items():
             known = one_of("states: sensor", name, kinds)
-            found += one._blocks(known, kinds[known], gravity)
-        return tuple(found)
+            blocks += states._blocks(known, kinds[known], gravity)
+        return tuple(blocks)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the declared states, as :func:`chosen` accepts them."""
-        found = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
-        for sensor, one in self.sensors.items():
-            found += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(one, fields)]
-        return tuple(found)
+        names = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
+        for sensor, states in self.sensors.items():
+            names += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(states, fields)]
+        return tuple(names)
 
     def select(self, names: tuple[str, ...]) -> States:
         """Return only the states with these names.
@@ -290,8 +290,8 @@ class States(ByValue):
             if not self.names:
                 raise InputError(f"states: {name!r} is requested, but no states are declared; leave it out")
             one_of("states: name", name, self.names)
-        sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
-        used = {sensor: one for sensor, one in sensors.items() if one._blocks(sensor, "direction", 1.0)}
+        sensors = {sensor: _kept(states, sensor, _SENSOR_PARTS, names) for sensor, states in self.sensors.items()}
+        used = {sensor: states for sensor, states in sensors.items() if states._blocks(sensor, "direction", 1.0)}
         return replace(_kept(self, "gyro", _GYRO_PARTS, names), sensors=used)
 
 
@@ -380,7 +380,7 @@ def to_table(states: States) -> dict[str, Any]:
     """Return states as a table of a file, units in the keys; exact in both directions."""
     table = tables.encode(states, FORM)
     if states.sensors:
-        table["sensors"] = {name: tables.encode(one, SENSOR_FORM) for name, one in states.sensors.items()}
+        table["sensors"] = {name: tables.encode(states, SENSOR_FORM) for name, states in states.sensors.items()}
     return table
 
 

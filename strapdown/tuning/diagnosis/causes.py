@@ -83,8 +83,8 @@ class Diagnosis(Listed):
     def listing(self) -> Table:
         """Return the causes considered, the most likely first, as a table."""
         rows = [
-            (one.name, one.of, one.gain, one.log_p, "likely" if one in self.causes else "no")
-            for one in self.considered[:8]
+            (cause.name, cause.of, cause.gain, cause.log_p, "likely" if cause in self.causes else "no")
+            for cause in self.considered[:8]
         ]
         notes = self.words.splitlines()
         return Table("Causes by what they would explain", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
@@ -126,8 +126,8 @@ class Diagnosis(Listed):
             :meth:`strapdown.consistency.Judgement.summary`.
         """
         causes = [
-            {**vars(one), "significant": one in self.causes, "alternative": one in self.alternatives}
-            for one in self.considered
+            {**vars(cause), "significant": cause in self.causes, "alternative": cause in self.alternatives}
+            for cause in self.considered
         ]
         table = {"probability": self.probability, "causes": causes, "judgement": self.judgement.summary()}
         return plain(table)  # type: ignore[no-any-return]

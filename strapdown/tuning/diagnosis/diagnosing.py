@@ -71,7 +71,9 @@ def diagnose(
     considered = [by_variance(model, base, hypothesis) for hypothesis in noise_hypotheses(model)]
     considered += [by_mean(model, base, hypothesis) for hypothesis in mean_hypotheses(model)]
     considered += [
-        outliers(sensor, found.whitened) for sensor, found in estimate.innovations.items() if len(found.time)
+        outliers(sensor, innovations.whitened)
+        for sensor, innovations in estimate.innovations.items()
+        if len(innovations.time)
     ]
     considered.append(commutation(record, setup, estimate, kept))
     worst = max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in estimate.innovations.values() if len(i.time))

@@ -27,18 +27,18 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
     """Yield the hypotheses that shift innovations."""
     record = model.record
     interval = float(np.median(record.intervals))
-    seen = [series for series in record.vectors if len(series.time)]
-    for series in seen:
+    measured = [series for series in record.vectors if len(series.time)]
+    for series in measured:
         yield _time_offset(series.sensor, (series.sensor,), interval)
         yield _mounting(series)
         if series.kind != "attitude":
             yield _body_fixed(series)
         if series.kind == "vector":
             yield _reference_length(series)
-        if len(seen) > 1:  # with one sensor, a rotated reference is only another fixed frame
+        if len(measured) > 1:  # with one sensor, a rotated reference is only another fixed frame
             yield _reference_direction(series)
-    if len(seen) > 1:
-        yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
+    if len(measured) > 1:
+        yield _time_offset("gyro", tuple(series.sensor for series in measured), interval)
     turned = turns(record, model.noise, model.initial)
     yield from (gyro_error(turned, *kind) for kind in GYRO_ERRORS)
     for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):
