@@ -587,14 +587,38 @@ def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
     assert ask("own") == [(10.0, 0)]
 
 
-def test_digest_depends_on_every_kernel_source(tmp_path):
-    copy = tmp_path / "kernels"
-    shutil.copytree(PACKAGE / "kernels", copy, ignore=shutil.ignore_patterns("__pycache__"))
-    seen = {machine.digest_of(copy.glob("**/*.py"))}
-    for path in sorted(copy.rglob("*.py")):
-        path.write_text(path.read_text() + "\n# edited\n")
-        seen.add(machine.digest_of(copy.glob("**/*.py")))
-    assert len(seen) == 1 + len(list(copy.rglob("*.py")))
+ASK_DIGESTS = """
+from pathlib import Path
+from strapdown.kernels import machine
+answer = {path.stem: machine.sources_digest(str(path)) for path in Path(machine.__file__).parent.glob("*.py")}
+"""
+
+
+def imports_of(path: Path) -> set[str]:
+    """Return the kernel modules that a file imports anywhere, by its syntax tree."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "strapdown.kernels":
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("strapdown.kernels."):
+            names.add((node.module or "").rpartition(".")[2])
+    return names
+
+
+def test_a_digest_depends_on_the_sources_used_and_on_no_others(copied_kernels):
+    imports = {path.stem: imports_of(path) for path in copied_kernels.glob("*.py")}
+    users = {name: {name} for name in imports}
+    for _ in imports:  # until it no longer grows
+        users = {name: those.union(*(users[k] for k in imports if imports[k] & those)) for name, those in users.items()}
+    ask = partial(in_a_new_process, copied_kernels.parent.parent, ASK_DIGESTS)
+    before = ask()
+    for edited in ("algebra", "filter", "gate", "montecarlo_run", "walk", "probe_constants", "compiler", "lanes"):
+        path = copied_kernels / f"{edited}.py"
+        path.write_text(path.read_text() + "# edited")
+        after = ask()
+        changed = {name for name in before if before[name] != after[name]}
+        assert changed == (set(imports) if edited in ("compiler", "lanes") else users[edited]), edited
+        before = after
 
 
 EDITED = """
@@ -602,13 +626,13 @@ from pathlib import Path
 from strapdown.kernels import machine
 path = Path(machine.__file__).with_name("probe.py")
 path.write_text(path.read_text() + "# edited")
-answer = machine.sources_digest()
+answer = machine.sources_digest(str(path))
 """
 
 
 def test_a_source_edited_while_a_process_runs_does_not_count_for_it(copied_kernels):
     """Otherwise its code would be stored as that of the edited source, and loaded with other arrays by the next process."""
     ask = partial(in_a_new_process, copied_kernels.parent.parent)
-    before = ask("from strapdown.kernels import machine\nanswer = machine.sources_digest()")
+    before = ask(EDITED.replace('path.write_text(path.read_text() + "# edited")', ""))
     assert ask(EDITED) == before
     assert ask(EDITED) != before

@@ -1,4 +1,4 @@
-"""Compilation of kernels: plain functions to numba dispatchers, with a disk cache that is invalidated by every edit.
+"""Compilation of kernels: plain functions to numba dispatchers, with a disk cache that is invalidated by every edit of what they use.
 
 A kernel refers to its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
 compiled copies ("twins") together, so the source needs no decorator and remains plain Python.
@@ -13,8 +13,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import platform
+import re
 import sys
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
@@ -27,23 +28,35 @@ INTRINSIC = {f"{PACKAGE}.lane_values": f"{PACKAGE}.lanes", f"{PACKAGE}.argument_
 """Modules whose functions are compiled by instructions of their own, which the other module writes."""
 
 
-def digest_of(paths: Iterable[Path]) -> str:
-    """Return a digest of files, in the order of their names."""
-    digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(path.read_bytes() if path.is_file() else b"")
-    return digest.hexdigest()
-
-
-_SOURCES = digest_of(Path(__file__).parent.glob("**/*.py"))
+_SOURCES = {path.stem: path.read_bytes() for path in Path(__file__).parent.glob("*.py")}
 """Read on import: if a source is edited later, the code of this process is not stored as that of the edited one."""
+_COMPILER = ("machine", "cache", "compiler", "tracing", "lanes", "addresses")
+"""Modules on which the code of every kernel depends."""
+_IMPORTED = re.compile(rb"^\s*from strapdown\.kernels(?:\.(\w+) import| import (.+))", re.MULTILINE)
 
 
 @functools.cache
-def sources_digest(parts: tuple[ModuleType, ...] = ()) -> str:
-    """Return a digest of all kernel sources and of ``parts``; numba's own key misses edits of helper modules and constants."""
-    others = [Path(module.__file__ or "") for module in parts if not module.__name__.startswith(PACKAGE)]
-    return _SOURCES + digest_of(others) if others else _SOURCES
+def _used(module: str) -> frozenset[str]:
+    """Return the kernel modules that one of them imports, directly or indirectly, and itself."""
+    names = re.findall(rb"\w+", b" ".join(map(b" ".join, _IMPORTED.findall(_SOURCES[module]))))
+    return frozenset([module]).union(*(_used(name.decode()) for name in names))
+
+
+@functools.cache
+def sources_digest(*files: str) -> str:
+    """Return a digest of kernel modules, given by their files, of all that they import, and of the compiler; other files are read.
+
+    numba's own key misses edits of helper modules and constants.
+    """
+    paths = [Path(file) for file in files]
+    inside = [path.stem for path in paths if path.parent == Path(__file__).parent]
+    digest = hashlib.sha256()
+    for name in sorted(frozenset[str]().union(*map(_used, (*_COMPILER, *inside)))):
+        digest.update(_SOURCES[name])
+    for path in paths:
+        if path.stem not in inside:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _is_kernel(value: object) -> bool:
@@ -161,7 +174,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 
 @functools.cache
 def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
-    """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources and those of ``parts``.
+    """Return ``function`` compiled for calls from Python, cached on disk under a digest of the sources that it uses.
 
     ``parts`` are the modules that define the open functions; of several definitions the first is used. The compiled function releases the
     GIL, so records can be distributed over threads.
@@ -186,9 +199,9 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
     dispatcher = numba.njit(**options)(function)
-    key = (*(module.__name__ for module in parts), sources_digest(parts))
+    files = (function.__code__.co_filename, *(str(module.__file__) for module in parts))
     try:
-        dispatcher._cache = Cache(function, sources_digest(), key)
+        dispatcher._cache = Cache(function, sources_digest(*files), tuple(module.__name__ for module in parts))
     except (RuntimeError, OSError):  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
