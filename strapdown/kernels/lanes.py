@@ -434,7 +434,7 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
 
 
 @_instead_of(lane_values.select, _choice)
-def _chosen(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
+def _selection(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
     result = sig.return_type
     if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
         # Without this LLVM may move a final operation common to both values behind the selection, where it no longer fuses with a product:

@@ -82,7 +82,7 @@ def record_case(record: ImuRecord, filter_setup: FilterSetup, *, name: str = "",
     ----------
     record : ImuRecord
         Gyro increments and measurements.
-    chosen : FilterSetup
+    filter_setup : FilterSetup
         Filter; defines the σ of the initial errors.
     name : str, optional
         Name of the record in messages and reports.

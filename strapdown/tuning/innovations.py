@@ -336,7 +336,7 @@ def likelihood(
     ----------
     cases : sequence of Case
         Records, with the filter's initial state on each.
-    chosen : FilterSetup
+    filter_setup : FilterSetup
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
         Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"SENSOR.sigma.x"`` (about one body axis),

@@ -91,8 +91,8 @@ class TunedGate:
 def tuned_gate(objective: Likelihood, tuning: Tuning) -> TunedGate:
     """Return the gate at the Bayes threshold, with its interval from those of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
-    squares = _seen(objective, tuning.point[:-2])
-    best, thresholds = _probability(squares, np.array([[share.value, scale.value]]))
+    sensors = _noise_by_sensor(objective, tuning.point[:-2])
+    best, thresholds = _probability(sensors, np.array([[share.value, scale.value]]))
     by_sensor = {name: float(value[0]) for name, value in thresholds.items()}
     if not share.identified or share.value > MAX_REFUSED:
         return TunedGate(
@@ -106,7 +106,7 @@ def tuned_gate(objective: Likelihood, tuning: Tuning) -> TunedGate:
     normal = np.random.default_rng(0).standard_normal((DRAWS, 2)) @ np.linalg.cholesky(covariance).T
     tried = np.exp(np.log([share.value, scale.value]) + normal)
     tried = np.column_stack([np.minimum(tried[:, 0], SHARES[1]), np.maximum(tried[:, 1], 1.01)])
-    lower, upper = np.quantile(_probability(squares, tried)[0], [0.025, 0.975])
+    lower, upper = np.quantile(_probability(sensors, tried)[0], [0.025, 0.975])
     return TunedGate(
         gate=replace(tuning.setup.gate or Gate(), probability=float(best[0])),
         probability=float(best[0]),
@@ -128,12 +128,12 @@ def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> 
         share=float(np.clip(share, *SHARES)),
         scale=float(np.clip(scale, *SCALES)),
     )
-    number = sum(group.degrees * group.number for group in _seen(other, other.start[:-2]).values())
+    number = sum(sensor.degrees * sensor.number for sensor in _noise_by_sensor(other, other.start[:-2]).values())
     return float(-other.minus_log(other.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Seen:
+class _SensorNoise:
     """Measurements of one sensor, as processed by the filter."""
 
     degrees: int
@@ -142,29 +142,29 @@ class _Seen:
     """Mean ratio of measurement noise to innovation variance."""
 
 
-def _seen(objective: Likelihood, point: Array) -> dict[str, _Seen]:
+def _noise_by_sensor(objective: Likelihood, point: Array) -> dict[str, _SensorNoise]:
     none = np.concatenate([point, [-np.inf, 0.0]])
     shares: dict[str, list[float]] = {}
     for name, rows in objective.judged(none):
         shares.setdefault(name, []).extend(rows[:, 1])
     kinds = {series.sensor: KINDS[series.kind] for case in objective.cases for series in case.record.vectors}
     return {
-        name: _Seen(degrees=kinds[name], number=len(own), noise=float(np.mean(own)))
+        name: _SensorNoise(degrees=kinds[name], number=len(own), noise=float(np.mean(own)))
         for name, own in shares.items()
         if own
     }
 
 
-def _probability(squares: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:
+def _probability(sensors: dict[str, _SensorNoise], tried: Array) -> tuple[Array, dict[str, Array]]:
     """Return the probability that a valid measurement is accepted, and the thresholds of the sensors, for each share and scale (k, 2)."""
     from scipy.special import chdtrc
 
     share, scale = tried.T
     thresholds, refused, total = {}, np.zeros(len(tried)), 0
-    for name, group in squares.items():
-        wider = 1.0 + (scale**2 - 1.0) * group.noise
-        odds = np.log1p(-share) - np.log(share) + 0.5 * group.degrees * np.log(wider)
+    for name, sensor in sensors.items():
+        wider = 1.0 + (scale**2 - 1.0) * sensor.noise
+        odds = np.log1p(-share) - np.log(share) + 0.5 * sensor.degrees * np.log(wider)
         thresholds[name] = np.maximum(2.0 * odds / (1.0 - 1.0 / wider), 0.0)
-        refused += group.number * np.log(np.maximum(chdtrc(group.degrees, thresholds[name]), MIN_REFUSED))
-        total += group.number
+        refused += sensor.number * np.log(np.maximum(chdtrc(sensor.degrees, thresholds[name]), MIN_REFUSED))
+        total += sensor.number
     return 1.0 - np.exp(refused / total), thresholds

@@ -71,19 +71,19 @@ class Own:
 
     Parameters
     ----------
-    given : callable, object with a method ``run``, or mapping
+    definition : callable, object with a method ``run``, or mapping
         Function or object, or the description of one that was read from a file, which cannot run.
     source : mapping, default empty
         For a filter read from a Python file: that file and its SHA-256, for the description.
     """
 
-    given: Any
+    definition: Any
     source: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that the filter can be called."""
-        if not isinstance(self.given, Mapping):
-            _function(self.given)
+        if not isinstance(self.definition, Mapping):
+            _function(self.definition)
 
     @property
     def name(self) -> str:
@@ -93,9 +93,9 @@ class Own:
     @functools.cached_property
     def table(self) -> dict[str, Any]:
         """Identity in files: name, parameters, and the SHA-256 of the source if available."""
-        if isinstance(self.given, Mapping):
-            return dict(self.given)
-        inner, parameters = self.given, {}
+        if isinstance(self.definition, Mapping):
+            return dict(self.definition)
+        inner, parameters = self.definition, {}
         while isinstance(inner, functools.partial):
             parameters.update({**{str(k): v for k, v in enumerate(inner.args)}, **inner.keywords})
             inner = inner.func
@@ -130,16 +130,16 @@ class Own:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the filter; its description is recomputed."""
-        return Own, (self.given, self.source)
+        return Own, (self.definition, self.source)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
         """Run the filter over a record without its truth, and check the result; if ``times`` of edges are given, return only those."""
-        if isinstance(self.given, Mapping):
+        if isinstance(self.definition, Mapping):
             raise InputError(
                 f"{self.name} is a filter of your own, whose code is not in the result file; give it again, "
                 f"{Hint('estimator', self.table.get('file', 'FILE.py:NAME'))}, as in replace(plan, setup=replace(plan.setup, estimator=…))"
             )
-        function = _function(_copied(self.given, self.name))
+        function = _function(_copied(self.definition, self.name))
         try:
             estimate = function(replace(record, truth=None), initial)
         except Exception as error:
