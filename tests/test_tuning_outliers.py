@@ -249,7 +249,7 @@ def recovered(seeds: int, duration: float) -> tuple[np.ndarray, np.ndarray, np.n
 def right_gate(duration: float) -> float:
     """The gate's probability at the truth."""
     objective = tuning.contaminated_likelihood([case(0, duration)], BELIEVED, FREE)
-    seen = outliers._seen(objective, np.log(TRUTH))
+    seen = outliers._noise_by_sensor(objective, np.log(TRUTH))
     return float(outliers._probability(seen, np.array([[0.05, 10.0]]))[0][0])
 
 
@@ -316,7 +316,7 @@ def test_random_starts_stay_where_outliers_are_outliers():
 def test_at_the_threshold_an_outlier_is_as_likely_as_none():
     """Where the state is known: the densities of both, times how frequent they are, are equal there."""
     for degrees, share, scale in ((1, 0.05, 10.0), (2, 0.01, 5.0), (3, 0.2, 3.0)):
-        seen = {"star": outliers._Seen(degrees=degrees, number=100, noise=1.0)}
+        seen = {"star": outliers._SensorNoise(degrees=degrees, number=100, noise=1.0)}
         (probability,), thresholds = outliers._probability(seen, np.array([[share, scale]]))
         e = np.zeros(degrees)
         e[0] = np.sqrt(thresholds["star"][0])
@@ -332,7 +332,7 @@ def test_the_share_of_its_own_noise_in_an_innovation_is_that_of_the_filter(state
     objective = tuning.contaminated_likelihood(
         [one], dataclasses.replace(KINDS, states=states), ("gyro.arw", "tracker.sigma")
     )
-    seen = outliers._seen(objective, objective.start[:-2])
+    seen = outliers._noise_by_sensor(objective, objective.start[:-2])
     estimate = setup.run(one.record, KINDS, one.initial)
     for series in one.record.vectors:
         own = series.sigma_axes if series.sigma_axes is not None else series.sigma[:, None]
