@@ -267,7 +267,7 @@ class States(ByValue):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the declared states, as :func:`chosen` accepts them."""
+        """Names of the declared states, as :meth:`select` accepts them."""
         names = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
         for sensor, states in self.sensors.items():
             names += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(states, fields)]
