@@ -533,11 +533,13 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
     if np.sum(lengths(reference[0])) < MIN_TURN:
         return None
     parts = {"gyro": np.repeat(_gyro_fits(turn, reference), len(FRAMES), axis=0)}
-    to_enu = np.stack([one.T for one in FRAMES.values()])[:, None]
+    to_enu = np.stack([frame.T for frame in FRAMES.values()])
     windows = _windows(recording, sensors, known)
     for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
-        v = _turned(means)[:, None] @ to_enu  # (readings, frames, 48, windows, 3)
-        parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(v).reshape(-1, len(AXES))
+        v = _turned(means)  # (readings, 48, windows, 3)
+        square = np.mean(np.sum(v**2, axis=-1), axis=-1)[:, None]
+        mean = v.mean(axis=-2)[:, None] @ to_enu  # (readings, frames, 48, 3)
+        parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(mean, square).reshape(-1, len(AXES))
     return _combined(parts, _floors(parts, FLOORS["reference"], sensors))
 
 
@@ -571,16 +573,16 @@ def _gyro_fits(turn: Array, reference: Array) -> Array:
     return np.asarray(misfit.reshape(len(reference), -1))
 
 
-def _force_fits(v: Array) -> Array:
-    """Return misfits (...,) of the mean specific force in each window (..., windows, 3), East-North-Up, with the vertical."""
-    return np.asarray(1.0 - 2.0 * v[..., 2].sum(axis=-1) / (np.sum(v**2, axis=(-2, -1)) + v.shape[-2]))
+def _force_fits(mean: Array, square: Array) -> Array:
+    """Return misfits (...,) of the specific force with the vertical, from its mean (..., 3), East-North-Up, and mean square."""
+    return np.asarray(1.0 - 2.0 * mean[..., 2] / (square + 1.0))
 
 
-def _field_fits(v: Array) -> Array:
-    """Return misfits (...,) of the mean field (..., windows, 3) with the best-fitting field that points North, of any dip."""
-    _, north, up = np.moveaxis(v.mean(axis=-2), -1, 0)
+def _field_fits(mean: Array, square: Array) -> Array:
+    """Return misfits (...,) of the field with the best-fitting one that points North, of any dip."""
+    _, north, up = np.moveaxis(mean, -1, 0)
     along = np.where(north > 0.0, np.hypot(north, up), np.abs(up))
-    return np.asarray(1.0 - 2.0 * along / (np.sum(v**2, axis=(-2, -1)) / v.shape[-2] + 1.0))
+    return np.asarray(1.0 - 2.0 * along / (square + 1.0))
 
 
 def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanations:
