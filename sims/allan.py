@@ -155,6 +155,6 @@ if __name__ == "__main__":
         for each in CASES:
             print(*lines(each, case(each, 134)), sep="\n", flush=True)
     else:
-        found = main(seed=arguments.seed, out=arguments.out)
-        print_fit(found.fit, found.truth)
-        print("figures:", *found.figures)
+        result = main(seed=arguments.seed, out=arguments.out)
+        print_fit(result.fit, result.truth)
+        print("figures:", *result.figures)

@@ -145,13 +145,13 @@ def main(*, units: int = 20, duration: float = 120.0, seed: int = 1, out: Path |
     attitude = []
     for k in range(units):
         unit = drawn_unit(seed + k)
-        found = sd.calibrate(simulated(unit, seed + k, 0, duration))
+        calibrated = sd.calibrate(simulated(unit, seed + k, 0, duration))
         for name in GROUPS:
-            true, value, own = (np.ravel(getattr(one, name)) for one in (unit, found, found.sigma))
+            true, value, own = (np.ravel(getattr(source, name)) for source in (unit, calibrated, calibrated.sigma))
             errors[name].append(value - true)
             sigma[name].append(own)
         second = simulated(unit, seed + k, 1, 40.0, pauses=False)
-        attitude.append([attitude_error(second, calibration) for calibration in (None, found)])
+        attitude.append([attitude_error(second, calibration) for calibration in (None, calibrated)])
     result = Result(
         errors={name: np.array(rows) for name, rows in errors.items()},
         sigma={name: np.array(rows) for name, rows in sigma.items()},

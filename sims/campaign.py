@@ -130,7 +130,7 @@ def plan(factor_q: float, factor_r: float, seed: int) -> Plan:
 def main(*, runs: int = 4000, seed: int = 1, machine: str = "auto", out: Path | str | None = None) -> Result:
     """Run each mismatch and compare it with its prediction. Figures are written to ``out`` if it is given."""
     plans = {name: plan(*factors, seed) for name, factors in FACTORS.items()}
-    statistics = {name: montecarlo.run_plan(one, runs=runs, machine=machine) for name, one in plans.items()}
+    statistics = {name: montecarlo.run_plan(plan, runs=runs, machine=machine) for name, plan in plans.items()}
     predictions = {name: predict(*factors, plans[name].epochs) for name, factors in FACTORS.items()}
     figures = []
     if out is not None:
@@ -150,14 +150,14 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
         low, high = consistency.mean_bounds(3, runs)
         ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a consistent filter")
         for k, name in enumerate(FACTORS):
-            found, predicted = statistics[name], predictions[name]
+            measured, predicted = statistics[name], predictions[name]
             if subset is None:
-                ax.plot(found.nis_time[::3], found.nis[::3], ".", markersize=3, color=style.CYCLE[k], label=name)
-                ax.plot(found.nis_time, predicted.nis, color=style.CYCLE[k], linewidth=1.0)
+                ax.plot(measured.nis_time[::3], measured.nis[::3], ".", markersize=3, color=style.CYCLE[k], label=name)
+                ax.plot(measured.nis_time, predicted.nis, color=style.CYCLE[k], linewidth=1.0)
             else:
                 column = ("state", "attitude", "bias").index(subset)
-                ax.plot(found.time, found.anees[:, column], ".", markersize=3, color=style.CYCLE[k], label=name)
-                ax.plot(found.time, predicted.anees(subset), color=style.CYCLE[k], linewidth=1.0)
+                ax.plot(measured.time, measured.anees[:, column], ".", markersize=3, color=style.CYCLE[k], label=name)
+                ax.plot(measured.time, predicted.anees(subset), color=style.CYCLE[k], linewidth=1.0)
         ax.set_yscale("log")
         ax.set_yticks([0.25, 0.5, 1.0, 2.0, 4.0], ["¼", "½", "1", "2", "4"])
         ax.minorticks_off()
@@ -183,12 +183,12 @@ if __name__ == "__main__":
     print(
         f"{arguments.runs} runs of each, machine: {result.machine}. At the end, per degree of freedom, from the runs (predicted):"
     )
-    for name, found in result.statistics.items():
+    for name, measured in result.statistics.items():
         predicted = result.predictions[name]
         parts = [
-            f"{subset} {found.anees[-1, k]:.3f} ({predicted.anees(subset)[-1]:.3f})"
+            f"{subset} {measured.anees[-1, k]:.3f} ({predicted.anees(subset)[-1]:.3f})"
             for k, subset in ((1, "attitude"), (2, "bias"))
         ]
-        verdict = "consistent" if montecarlo.summary(found)["consistent"] else "NOT consistent"
-        print(f"{name:6s} NEES of {', '.join(parts)}, NIS {found.nis[-1]:.3f} ({predicted.nis[-1]:.3f}): {verdict}")
+        verdict = "consistent" if montecarlo.summary(measured)["consistent"] else "NOT consistent"
+        print(f"{name:6s} NEES of {', '.join(parts)}, NIS {measured.nis[-1]:.3f} ({predicted.nis[-1]:.3f}): {verdict}")
     print("figures:", *result.figures)

@@ -156,19 +156,19 @@ def runge_kutta_step(powers: Sequence[Vector], samples: int) -> Vector:
     """Return the classical Runge–Kutta step over ``samples`` intervals on a rate polynomial, normalised."""
     n = samples
     rates = [combination([(mp.mpf(n) * f) ** k for k in range(len(powers))], powers) for f in (0, mp.mpf(1) / 2, 1)]
-    one = (mp.mpf(1), mp.mpf(0), mp.mpf(0), mp.mpf(0))
+    identity = (mp.mpf(1), mp.mpf(0), mp.mpf(0), mp.mpf(0))
 
     def slope(q: Vector, w: Vector) -> Vector:
         return tuple(n * x / 2 for x in multiply(q, (0, *w)))
 
     def moved(k: Vector, h: Any) -> Vector:
-        return tuple(a + h * b for a, b in zip(one, k, strict=True))
+        return tuple(a + h * b for a, b in zip(identity, k, strict=True))
 
-    k1 = slope(one, rates[0])
+    k1 = slope(identity, rates[0])
     k2 = slope(moved(k1, mp.mpf(1) / 2), rates[1])
     k3 = slope(moved(k2, mp.mpf(1) / 2), rates[1])
     k4 = slope(moved(k3, 1), rates[2])
-    return unit(tuple(o + (a + 2 * b + 2 * c + d) / 6 for o, a, b, c, d in zip(one, k1, k2, k3, k4, strict=True)))
+    return unit(tuple(o + (a + 2 * b + 2 * c + d) / 6 for o, a, b, c, d in zip(identity, k1, k2, k3, k4, strict=True)))
 
 
 def moment_step(solver: str, powers: Sequence[Vector], samples: int) -> Vector:
@@ -461,10 +461,10 @@ def manoeuvres(count: int, seed: int) -> ManoeuvreError:
         truth = HarmonicRates(harmonics=harmonics, mean=tuple(generator.uniform(-0.5, 0.5, 3)))
         attitude, increments = truth.attitude(edges), truth.increments(edges)
         ratios.append(ratio)
-        for name, found in errors.items():
+        for name, norms in errors.items():
             n = ALGORITHMS[name].samples
             estimate = coning.integrate(increments, name, attitude[0])
-            found.append(float(np.linalg.norm(log(multiply(conjugate(estimate), attitude[::n])), axis=1).max()))
+            norms.append(float(np.linalg.norm(log(multiply(conjugate(estimate), attitude[::n])), axis=1).max()))
     return ManoeuvreError(ratios=tuple(ratios), errors=errors)
 
 

@@ -141,13 +141,13 @@ def main(
     out: str | os.PathLike[str] | None = None,
 ) -> Result:
     """Predict and run; ``duration`` in s, that of the scenario if not given. Figures and table are written to ``out`` if it is given."""
-    chosen = scenarios.load_scenario(scenario)
+    base = scenarios.load_scenario(scenario)
     if duration is not None:
-        chosen = dataclasses.replace(chosen, duration=duration)
-    matched = setup.FilterSetup.for_scenario(chosen, attitude_sigma=0.1 * DEGREE, states=False)
+        base = dataclasses.replace(base, duration=duration)
+    matched = setup.FilterSetup.for_scenario(base, attitude_sigma=0.1 * DEGREE, states=False)
     filters = (("matched", matched), ("a quarter of Q", more_sure(matched)))
     comparisons = tuple(
-        compare(name, chosen, filter_setup, runs=runs, epochs=epochs, seed=seed) for name, filter_setup in filters
+        compare(name, base, filter_setup, runs=runs, epochs=epochs, seed=seed) for name, filter_setup in filters
     )
     if out is None:
         return Result(comparisons=comparisons, figures=())

@@ -138,7 +138,7 @@ def in_c(setup: sd.FilterSetup, record: ImuRecord, start: Array, folder: Path, p
     if compiler is None:
         raise SystemExit("there is no C compiler: install one, for example gcc")
     sd.export(setup, record, folder=folder, precision=precision)  # type: ignore[arg-type]
-    names = [one.sensor for one in record.vectors]
+    names = [series.sensor for series in record.vectors]
     cases = "\n".join(f"case {i}: strapdown_update_{name}(&f, v); break;" for i, name in enumerate(names))
     text = LOOP.replace("CASES", cases).replace("START", "{" + ", ".join(f"{x!r}" for x in start.tolist()) + "}")
     (folder / "run.c").write_text(text, encoding="utf-8")
@@ -228,9 +228,9 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("results/export_filter"))
     parser.add_argument("--duration", type=float, default=60.0, help="s")
     parser.add_argument("--seed", type=int, default=1)
-    found = main(**vars(parser.parse_args()))
+    result = main(**vars(parser.parse_args()))
     print(
-        f"largest difference of the attitude: double {found.difference:.1e} rad, single {found.difference_single:.1e} σ"
+        f"largest difference of the attitude: double {result.difference:.1e} rad, single {result.difference_single:.1e} σ"
     )
-    for name, run in (("double", found.double), ("single", found.single)):
+    for name, run in (("double", result.double), ("single", result.single)):
         print(f"{name}: {1e9 * run.seconds:.0f} ns per sample with its measurements, {run.text} bytes of machine code")

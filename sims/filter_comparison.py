@@ -65,10 +65,10 @@ def vqf_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) 
     """VQF (Laidig & Seel 2023), C++; the gain divides both time constants."""
     import vqf
 
-    found = vqf.VQF(interval, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(
+    outputs = vqf.VQF(interval, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(
         *(np.ascontiguousarray(x) for x in (gyro, 9.81 * acc, mag))
     )
-    return np.asarray(found["quat9D"])
+    return np.asarray(outputs["quat9D"])
 
 
 def imufusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
@@ -240,9 +240,9 @@ def frame_of(attitude: Array, time: Array, truth: Array) -> alignment.Alignment:
     """Return the rotations by right angles between a peer's frames and the package's, from the second half of a record."""
     half = slice(len(time) // 2, None)
     series = alignment.Series(time[half], quaternion.normalize(attitude)[half])
-    found = alignment.fit(series, alignment.Series(time[half], truth[half]), ("fixed", "body"), 0.0)
-    snapped = {name: _snapped(getattr(found, name)) for name in ("fixed", "body")}
-    return alignment.Alignment(**{**vars(found), **snapped})
+    fitted = alignment.fit(series, alignment.Series(time[half], truth[half]), ("fixed", "body"), 0.0)
+    snapped = {name: _snapped(getattr(fitted, name)) for name in ("fixed", "body")}
+    return alignment.Alignment(**{**vars(fitted), **snapped})
 
 
 def _snapped(rotation: Array) -> Array:
@@ -318,9 +318,9 @@ def main(
 
         scores = [np.mean([np.mean(errors_of(attitude(r, gain)[0], r) ** 2) for r in trained]) for gain in GAINS]
         best = GAINS[int(np.argmin(scores))]
-        found = [(attitude(record, best), record) for record in records]
-        squares = [np.mean(errors_of(q, record) ** 2) for (q, _), record in found]
-        spent = [seconds for (_, seconds), _ in found]
+        results = [(attitude(record, best), record) for record in records]
+        squares = [np.mean(errors_of(q, record) ** 2) for (q, _), record in results]
+        spent = [seconds for (_, seconds), _ in results]
         outcomes.append(_outcome(name, squares, spent, bound, len(records[0].increments), np.nan, None, best))
     result = Result(
         outcomes=tuple(outcomes), bound=bound, recorded=on_recordings(recorded, progress) if recorded else {}
@@ -335,9 +335,10 @@ def main(
             "duration_s": duration,
             "peers": {package: version(package) for package, _ in PEERS.values() if importlib.util.find_spec(package)},
             "root_pcrb_deg": bound / DEGREE,
-            "outcomes": [one.summary() for one in result.outcomes],
+            "outcomes": [outcome.summary() for outcome in result.outcomes],
             "recordings": [Path(file).stem for file in files] or before.get("recordings", []),
-            "recorded": {name: one.summary() for name, one in result.recorded.items()} or before.get("recorded", {}),
+            "recorded": {name: outcome.summary() for name, outcome in result.recorded.items()}
+            or before.get("recorded", {}),
         }
         Path(out).mkdir(parents=True, exist_ok=True)
         write_json(path, content)
@@ -349,20 +350,20 @@ def main(
 
 def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of ``strapdown estimate``."""
-    chosen = replace(HAND_HELD, velocity_sigma=HAND_HELD.velocity_sigma / gain)
-    found = ahrs.estimate(recording, chosen)
-    return found.recording.time, found.estimate.attitude
+    parameters = replace(HAND_HELD, velocity_sigma=HAND_HELD.velocity_sigma / gain)
+    result = ahrs.estimate(recording, parameters)
+    return result.recording.time, result.estimate.attitude
 
 
 def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the same measurements as the MEKF."""
-    found = ahrs.estimate(recording, AhrsParameters())
+    result = ahrs.estimate(recording, AhrsParameters())
     noise = HAND_HELD.setup.process_noise
     factor = 8.0 * gain  # fixed gains must also allow for disturbances
     scaled = ProcessNoise(
         angle_random_walk=factor * noise.angle_random_walk, rate_random_walk=factor**2 * noise.rate_random_walk
     )
-    return found.record.time, filters.run("mahony", found.record, scaled, found.initial).attitude
+    return result.record.time, filters.run("mahony", result.record, scaled, result.initial).attitude
 
 
 def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array, Array]]:
@@ -382,18 +383,18 @@ def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array,
 
 def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
     """Return the errors of each filter on recordings with a reference, with its gain chosen on the others."""
-    begun = [int(np.searchsorted(one.time, ahrs.estimate(one).recording.time[0])) for one in read]
-    whole = [one.since(first) for one, first in zip(read, begun, strict=True)]  # with the package's start
-    short = [_until(one, float(one.time[np.argmax(one.movement)]) + SEARCHED) for one in whole]
-    chosen: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
+    begun = [int(np.searchsorted(recording.time, ahrs.estimate(recording).recording.time[0])) for recording in read]
+    whole = [recording.since(first) for recording, first in zip(read, begun, strict=True)]  # with the package's start
+    short = [_until(recording, float(recording.time[np.argmax(recording.movement)]) + SEARCHED) for recording in whole]
+    candidates: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
         "strapdown estimate": ours,
         "complementary": complementary,
     }
-    chosen |= {
+    candidates |= {
         name: peer_on(f, SLOW.get(name, 1)) for name, (package, f) in PEERS.items() if importlib.util.find_spec(package)
     }
     result = {}
-    for name, run in chosen.items():
+    for name, run in candidates.items():
         frame = None
         if name in PEERS:
             time, q = run(short[0], 1.0)
@@ -401,18 +402,21 @@ def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | N
             truth = short[0].true_attitude[np.searchsorted(short[0].time, time)]
             known = np.isfinite(truth).all(axis=1)
             frame = frame_of(q[known], time[known], truth[known])
-        search = np.array([[_errors(run, frame, one, gain)[0][0] for gain in RECORDED_GAINS] for one in short])
+        search = np.array(
+            [[_errors(run, frame, recording, gain)[0][0] for gain in RECORDED_GAINS] for recording in short]
+        )
         others = search.sum(axis=0) - search
         gains = np.array(RECORDED_GAINS)[np.argmin(others, axis=1)]
-        found = [_errors(run, frame, one, gain) for one, gain in zip(whole, gains, strict=True)]
+        scores = [_errors(run, frame, recording, gain) for recording, gain in zip(whole, gains, strict=True)]
         plain = [
-            f if g == 1.0 else _errors(run, frame, one, 1.0) for f, g, one in zip(found, gains, whole, strict=True)
+            f if g == 1.0 else _errors(run, frame, recording, 1.0)
+            for f, g, recording in zip(scores, gains, whole, strict=True)
         ]
         result[name] = Recorded(
-            errors=np.array([one for one, _ in found]),
-            default=np.array([one for one, _ in plain]),
+            errors=np.array([error for error, _ in scores]),
+            default=np.array([error for error, _ in plain]),
             gains=gains,
-            microseconds=1e6 * float(np.median([spent for _, spent in found])),
+            microseconds=1e6 * float(np.median([spent for _, spent in scores])),
         )
         if progress is not None:
             mean = ", ".join(f"{x:.2f}" for x in result[name].errors.mean(axis=0) / DEGREE)
@@ -473,13 +477,13 @@ def table(result: Result) -> str:
         "| filter | runs | RMS, ° | RMS/√PCRB | ANEES attitude | consistent | µs per sample | gain over default |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for one in result.outcomes:
-        judged = "no covariance" if one.consistent is None else "yes" if one.consistent else "NO"
-        anees = "" if np.isnan(one.anees) else f"{one.anees:.3g}"
-        gain = "" if np.isnan(one.gain) else f"{one.gain:g}"
+    for outcome in result.outcomes:
+        judged = "no covariance" if outcome.consistent is None else "yes" if outcome.consistent else "NO"
+        anees = "" if np.isnan(outcome.anees) else f"{outcome.anees:.3g}"
+        gain = "" if np.isnan(outcome.gain) else f"{outcome.gain:g}"
         lines.append(
-            f"| {one.name} | {one.runs} | {one.rms / DEGREE:.4f} | {one.ratio:.3f} | {anees} | {judged} | "
-            f"{one.microseconds:.3g} | {gain} |"
+            f"| {outcome.name} | {outcome.runs} | {outcome.rms / DEGREE:.4f} | {outcome.ratio:.3f} | {anees} | {judged} | "
+            f"{outcome.microseconds:.3g} | {gain} |"
         )
     return "\n".join(lines)
 
@@ -490,5 +494,5 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/filter_comparison"))
-    found = main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))
-    print(f"Root of the bound: {found.bound / DEGREE:.4f}° per axis.\n\n{table(found)}")
+    result = main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))
+    print(f"Root of the bound: {result.bound / DEGREE:.4f}° per axis.\n\n{table(result)}")

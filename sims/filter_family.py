@@ -115,7 +115,7 @@ class Step(NamedTuple):
 def steps(record: ImuRecord) -> Iterator[Step]:
     """Yield the steps of a filter over a record."""
     times = [(t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time)]
-    waiting = [one for one in sorted(times) if one[0] >= record.time[0]]
+    waiting = [due for due in sorted(times) if due[0] >= record.time[0]]
     now, rate = record.time[0], np.zeros((1, 3))
     rates = np.concatenate([rate, record.increments / record.intervals[:, None]])
     for end, rate in zip(record.time, rates, strict=True):
@@ -592,5 +592,5 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--unscented-runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    found = main(**vars(parser.parse_args()))
-    print("\n".join([table(found), "", *findings(found)]))
+    result = main(**vars(parser.parse_args()))
+    print("\n".join([table(result), "", *findings(result)]))

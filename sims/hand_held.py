@@ -114,7 +114,7 @@ class Result:
 
     def mean(self, name: str, treatment: str = "as recorded") -> Array:
         """Return the mean errors of one filter over the recordings (3,), rad."""
-        return np.asarray(np.mean([one.errors for one in self.scores[treatment][name]], axis=0))
+        return np.asarray(np.mean([score.errors for score in self.scores[treatment][name]], axis=0))
 
 
 def swelling(t: Array, w: float, phase: Array) -> tuple[Array, Array]:
@@ -163,11 +163,11 @@ def simulated(seed: int, run: int, duration: float) -> Recording:
 def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
     """Return the recording at the filter's steps, and the attitude with the acceleration modelled as first-order coloured noise."""
     plain = ahrs.estimate(recording, replace(BOUNDED, velocity_sigma=0.0, specific_force_noise=0.06), latency=latency)
-    found = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (COLOURED,))
+    estimate = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (COLOURED,))
     used = plain.recording
     rows = np.searchsorted(used.time, plain.record.time)
     names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
-    return replace(used, **{name: getattr(used, name)[rows] for name in names}), found.attitude
+    return replace(used, **{name: getattr(used, name)[rows] for name in names}), estimate.attitude
 
 
 def gyro_latency(recording: Recording) -> tuple[float, float]:
@@ -195,8 +195,8 @@ def gyro_latency(recording: Recording) -> tuple[float, float]:
         error = wanted - model @ np.linalg.lstsq(model, wanted, rcond=None)[0]
         return float(np.sqrt(np.median(np.sum(error**2, axis=1))))
 
-    found = minimize_scalar(left, bounds=(-0.03, 0.03), method="bounded", options={"xatol": 1e-5})
-    return float(found.x), float(found.fun)
+    optimum = minimize_scalar(left, bounds=(-0.03, 0.03), method="bounded", options={"xatol": 1e-5})
+    return float(optimum.x), float(optimum.fun)
 
 
 def shifted(recording: Recording, latency: float) -> Recording:
@@ -204,7 +204,9 @@ def shifted(recording: Recording, latency: float) -> Recording:
     moved = {}
     for name in ("rate", "specific_force", "magnetic_field"):
         columns = getattr(recording, name).T
-        moved[name] = np.stack([np.interp(recording.time + latency, recording.time, one) for one in columns], axis=1)
+        moved[name] = np.stack(
+            [np.interp(recording.time + latency, recording.time, column) for column in columns], axis=1
+        )
     return replace(recording, **moved)
 
 
@@ -256,23 +258,23 @@ def _rows(recording: Recording, rows: np.ndarray) -> Recording:
 
 def scored(result: AhrsEstimate, taken: float) -> Score:
     """Return errors, coverage and NIS of one of our estimates, which has full covariances."""
-    used, found = result.recording, result.estimate
+    used, estimate = result.recording, result.estimate
     assert used.true_attitude is not None
-    assert found.covariance is not None
+    assert estimate.covariance is not None
     judged = np.isfinite(used.true_attitude).all(axis=1)
     if used.movement is not None:
         judged &= used.movement
-    R = quaternion.to_matrix(found.attitude[judged])
+    R = quaternion.to_matrix(estimate.attitude[judged])
     reference = quaternion.normalize(used.true_attitude[judged])
-    error = quaternion.log(quaternion.multiply(reference, quaternion.conjugate(found.attitude[judged])))
-    P = R @ found.covariance[judged][:, :3, :3] @ R.transpose(0, 2, 1)  # fixed axes, as the error
+    error = quaternion.log(quaternion.multiply(reference, quaternion.conjugate(estimate.attitude[judged])))
+    P = R @ estimate.covariance[judged][:, :3, :3] @ R.transpose(0, 2, 1)  # fixed axes, as the error
 
     def held(part: slice) -> float:
         e, own = error[:, part], P[:, part, part]
         square = np.einsum("ki,ki->k", e, np.linalg.solve(own, e[..., None])[..., 0])
         return float(np.mean(square <= chi2.ppf(0.95, e.shape[1])))
 
-    errors = reference_errors(found.attitude, used.true_attitude).rms(used.movement)
+    errors = reference_errors(estimate.attitude, used.true_attitude).rms(used.movement)
     if used.magnetic_field is None:  # with an arbitrary heading only the inclination is defined
         errors = {**errors, "total": np.nan, "heading": np.nan}
     return Score(
@@ -280,7 +282,10 @@ def scored(result: AhrsEstimate, taken: float) -> Score:
         time=taken / len(used.time),
         coverage=(held(slice(0, 3)), held(slice(2, 3)), held(slice(0, 2))),
         sigma=float(np.sqrt(np.mean(np.trace(P, axis1=1, axis2=2)))),
-        nis=tuple(float(np.mean(one.nis)) / one.innovation.shape[1] for one in found.innovations.values()),
+        nis=tuple(
+            float(np.mean(innovations.nis)) / innovations.innovation.shape[1]
+            for innovations in estimate.innovations.values()
+        ),
     )
 
 
@@ -299,11 +304,11 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
         return {}
     interval = used.interval
     samples = [np.ascontiguousarray(each) for each in (used.rate, used.specific_force, used.magnetic_field)]
-    found: dict[str, tuple[Array, float]] = {}
+    results: dict[str, tuple[Array, float]] = {}
 
     def timed(name: str, call: Callable[[], Array]) -> None:
         begin = clock.process_time()
-        found[name] = (call(), clock.process_time() - begin)
+        results[name] = (call(), clock.process_time() - begin)
 
     try:
         import vqf
@@ -328,7 +333,7 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
         begun = ahrs.start(used, sensor_delays.gyro_attitude(used), HAND_HELD).attitude
         begun = quaternion.multiply(quaternion.conjugate(quarter), begun)
         timed("Madgwick", lambda: quaternion.multiply(quarter, Madgwick(*samples, Dt=interval, q0=begun).Q))
-    return found
+    return results
 
 
 def _imufusion(imufusion, samples: Sequence[Array], interval: float) -> Array:  # type: ignore[no-untyped-def]
@@ -349,29 +354,29 @@ def _imufusion(imufusion, samples: Sequence[Array], interval: float) -> Array:  
 
 def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Score], list[AhrsEstimate]]:
     """Return the scores of every filter on a recording, and our estimates; ``latency`` in s; None: as recorded."""
-    found, scores = [], {}
+    results, scores = [], {}
     for name, options in (
         ("strapdown", {}),
         ("strapdown, smoother", {"smooth": True}),
         ("strapdown, any motion", {"parameters": AhrsParameters()}),
     ):
         result, scores[name] = ours(recording, latency, **options)
-        found.append(result)
+        results.append(result)
     # All filters start at the same time as ours.
-    begin = int(np.searchsorted(recording.time, found[0].recording.time[0]))
+    begin = int(np.searchsorted(recording.time, results[0].recording.time[0]))
     used = (recording if latency is None else shifted(recording, latency)).since(begin)
     for name, (attitude, taken) in peers(used).items():
         errors = reference_errors(attitude, used.true_attitude).rms(used.movement)  # type: ignore[arg-type]
         scores[name] = Score(errors=tuple(errors[part] for part in PARTS), time=taken / len(used.time))
-    return {name: scores[name] for name in COLOURS if name in scores}, found
+    return {name: scores[name] for name in COLOURS if name in scores}, results
 
 
 def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool) -> Array:
     """Return the total error on each recording with the candidate of minimum mean error on the others (recordings,), rad."""
     errors = np.empty((len(read), len(CANDIDATES)))
-    for k, one in enumerate(read):
+    for k, recording in enumerate(read):
         for c, candidate in enumerate(CANDIDATES.values()):
-            errors[k, c] = ours(one, latency, candidate, smooth)[1].errors[0]
+            errors[k, c] = ours(recording, latency, candidate, smooth)[1].errors[0]
     others = errors.sum(axis=0) - errors
     return np.asarray(errors[np.arange(len(read)), np.argmin(others, axis=1)])
 
@@ -384,7 +389,7 @@ def draw(result: Result, path: Path) -> Path:
     places = np.arange(len(result.recordings) + 1)
     for axis, part in zip(axes, (2, 0), strict=True):
         for k, (name, each) in enumerate(scores.items()):
-            values = np.array([one.errors[part] for one in each]) / DEGREE
+            values = np.array([score.errors[part] for score in each]) / DEGREE
             shift = 0.1 * (k - 0.5 * (len(scores) - 1))
             marker = "o" if name.startswith("strapdown") else "D"
             axis.plot(
@@ -405,10 +410,10 @@ def draw(result: Result, path: Path) -> Path:
     return plots.save(figure, path)
 
 
-def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
+def draw_worst(results: Sequence[AhrsEstimate], path: Path) -> Path:
     """Draw heading and inclination errors over time with ±2σ for the given recordings, and write the figure."""
-    figure, axes = plots.new_figure(2, len(found), size=(6.5 * len(found), 6.0))
-    for column, result in zip(np.reshape(axes, (2, len(found))).T, found, strict=True):
+    figure, axes = plots.new_figure(2, len(results), size=(6.5 * len(results), 6.0))
+    for column, result in zip(np.reshape(axes, (2, len(results))).T, results, strict=True):
         used, estimate = result.recording, result.estimate
         assert used.true_attitude is not None
         assert estimate.covariance is not None
@@ -427,7 +432,7 @@ def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
 def _plain(score: Score) -> dict[str, object]:
     """Return a score for JSON, where NaN, the error of an arbitrary heading, is null."""
     plain = asdict(score)
-    plain["errors"] = [None if np.isnan(one) else one for one in score.errors]
+    plain["errors"] = [None if np.isnan(error) else error for error in score.errors]
     return {**plain, "sigma": None if np.isnan(score.sigma) else score.sigma}
 
 
@@ -439,7 +444,7 @@ def _heads(names: Sequence[str]) -> list[str]:
 def table(result: Result) -> str:
     """Return the figures as text."""
     width = 2 + max(
-        len(name) for name in (*COLOURS, *result.modified, *(f"left out, {one}" for one in result.left_out))
+        len(name) for name in (*COLOURS, *result.modified, *(f"left out, {part}" for part in result.left_out))
     )
     lines = []
     for treatment, scores in result.scores.items():
@@ -448,31 +453,37 @@ def table(result: Result) -> str:
             f"{'':{width}s}{'total':>7s}{'head.':>7s}{'incl.':>7s}{'worst':>7s}{'us':>7s}   coverage total/head./incl. (worst)  NIS acc/mag"
         )
         for name, each in scores.items():
-            mean = np.mean([one.errors for one in each], axis=0) / DEGREE
-            worst, time = max(one.errors[0] for one in each) / DEGREE, 1e6 * np.median([one.time for one in each])
+            mean = np.mean([score.errors for score in each], axis=0) / DEGREE
+            worst, time = (
+                max(score.errors[0] for score in each) / DEGREE,
+                1e6 * np.median([score.time for score in each]),
+            )
             line = f"{name:{width}s}{mean[0]:7.2f}{mean[1]:7.2f}{mean[2]:7.2f}{worst:7.2f}{time:7.2f}"
             if each[0].coverage is not None:
-                cover = np.array([one.coverage for one in each])
-                nis = np.exp(np.mean([np.log(one.nis) for one in each], axis=0))
+                cover = np.array([score.coverage for score in each])
+                nis = np.exp(np.mean([np.log(score.nis) for score in each], axis=0))
                 line += f"   {'/'.join(f'{c:.2f}' for c in cover.mean(axis=0))} ({cover[:, 0].min():.2f})"
-                line += f"{'':18s}{'/'.join(f'{one:.2g}' for one in nis)}"
+                line += f"{'':18s}{'/'.join(f'{ratio:.2g}' for ratio in nis)}"
             lines.append(line)
         lines += ["", f"{'Total':{width}s}" + "".join(f"{head:>7s}" for head in _heads(result.recordings))]
         for name, each in scores.items():
-            lines.append(f"{name:{width}s}" + "".join(f"{one.errors[0] / DEGREE:7.2f}" for one in each))
+            lines.append(f"{name:{width}s}" + "".join(f"{score.errors[0] / DEGREE:7.2f}" for score in each))
         lines.append("")
     for name, errors in result.left_out.items():
-        each = "".join(f"{one / DEGREE:7.2f}" for one in errors)
+        each = "".join(f"{error / DEGREE:7.2f}" for error in errors)
         lines.append(f"{f'left out, {name}':{width}s}{each}   mean {errors.mean() / DEGREE:.2f}")
     lines += ["", f"{'MODIFIED, ONLINE':{width}s}{'total':>7s}{'incl.':>7s}{'sigma':>7s}   coverage total/head./incl."]
     for name, each in result.modified.items():
-        mean = np.sqrt(np.mean(np.square([one.errors for one in each]), axis=0)) / DEGREE
-        sigma, cover = np.sqrt(np.mean([one.sigma**2 for one in each])), np.mean([one.coverage for one in each], axis=0)
+        mean = np.sqrt(np.mean(np.square([score.errors for score in each]), axis=0)) / DEGREE
+        sigma, cover = (
+            np.sqrt(np.mean([score.sigma**2 for score in each])),
+            np.mean([score.coverage for score in each], axis=0),
+        )
         lines.append(
             f"{name:{width}s}{mean[0]:7.2f}{mean[2]:7.2f}{sigma / DEGREE:7.2f}   {'/'.join(f'{c:.2f}' for c in cover)}"
         )
     late = 1e3 * result.latencies
-    lines += ["", f"{'gyro delay, ms':{width}s}{''.join(f'{one:7.2f}' for one in late)}   mean {late.mean():.2f}"]
+    lines += ["", f"{'gyro delay, ms':{width}s}{''.join(f'{delay:7.2f}' for delay in late)}   mean {late.mean():.2f}"]
     return "\n".join(lines)
 
 
@@ -492,37 +503,37 @@ def main(
     ``out`` if it is given; ``progress`` is called with a line for each recording.
     """
     read = [recordings.read(file) for file in files] or [simulated(seed, k, duration) for k in range(runs)]
-    for one in read:
-        if one.true_attitude is None:
-            raise InputError(f"{one.source} has no reference attitude to compare with; give BROAD files")
+    for recording in read:
+        if recording.true_attitude is None:
+            raise InputError(f"{recording.source} has no reference attitude to compare with; give BROAD files")
     late = 1e-3 * latency if files else 0.0
     scores: dict[str, dict[str, list[Score]]] = {"as recorded": {}, "compensated": {}}
     changed: dict[str, list[Score]] = {}
     online: list[AhrsEstimate] = []
-    for k, one in enumerate(read):
+    for k, recording in enumerate(read):
         for treatment, each in scores.items():
-            found, estimates = compared(one, None if treatment == "as recorded" else late)
-            for name, score in found.items():
+            by_filter, estimates = compared(recording, None if treatment == "as recorded" else late)
+            for name, score in by_filter.items():
                 each.setdefault(name, []).append(score)
         online.append(estimates[0])
-        for name, other in modified(one).items():
+        for name, other in modified(recording).items():
             parameters = replace(HAND_HELD, hard_iron_sigma=0.0) if "no states" in name else None
             changed.setdefault(name.split(" at ")[0], []).append(ours(other, late, parameters)[1])
         if progress is not None:
-            progress(f"{k + 1} of {len(read)}: {one.source}")
+            progress(f"{k + 1} of {len(read)}: {recording.source}")
     result = Result(
-        recordings=tuple(Path(one.source).stem for one in read),
+        recordings=tuple(Path(recording.source).stem for recording in read),
         scores=scores,
         left_out={name: leave_one_out(read, late, name == "smoothed") for name in ("online", "smoothed")},
         modified=changed,
-        latencies=np.array([gyro_latency(one)[0] for one in read]),
+        latencies=np.array([gyro_latency(recording)[0] for recording in read]),
         figures=(),
     )
     if out is None:
         return result
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    worst = np.argsort([-one.errors[0] for one in scores["compensated"]["strapdown"]])[:2]
+    worst = np.argsort([-score.errors[0] for score in scores["compensated"]["strapdown"]])[:2]
     figures = (
         draw(result, folder / "hand_held.png"),
         draw_worst([online[k] for k in worst], folder / "hand_held_worst.png"),
@@ -534,7 +545,7 @@ def main(
         "latency_ms": 1e3 * late,
         "gyro_latency_ms": (1e3 * result.latencies).tolist(),
         "scores": {
-            treatment: {name: [_plain(one) for one in each] for name, each in some.items()}
+            treatment: {name: [_plain(score) for score in each] for name, each in some.items()}
             for treatment, some in {**scores, "modified": changed}.items()
         },
         "left_out_total_rad": {name: errors.tolist() for name, errors in result.left_out.items()},

@@ -192,8 +192,8 @@ if __name__ == "__main__":
     parser.add_argument("--duration", type=float, default=10.0, help="s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--show", action="store_true", help="draw in a window while it runs")
-    found = main(**vars(parser.parse_args()))
+    result = main(**vars(parser.parse_args()))
     print(
-        f"{1e6 * found.update:.1f} µs per update, {1e3 * found.behind:.2f} ms behind at most (99 %), {found.late} too late; "
-        f"at the end error {found.error[-1] / DEGREE:.2f}°, σ {found.sigma[-1] / DEGREE:.2f}°"
+        f"{1e6 * result.update:.1f} µs per update, {1e3 * result.behind:.2f} ms behind at most (99 %), {result.late} too late; "
+        f"at the end error {result.error[-1] / DEGREE:.2f}°, σ {result.sigma[-1] / DEGREE:.2f}°"
     )

@@ -102,18 +102,18 @@ def main(*, runs: int = 200, duration: float = 60.0, seed: int = 1, out: Path | 
     """Judge the filters over the same runs; verdicts are written to ``out`` if it is given."""
     flight = scenario(duration)
     base = setup.FilterSetup.for_scenario(flight, states=False)
-    setups = [replace(base, estimator=one) for one in FILTERS.values()]
-    found = montecarlo.run(flight, setups, runs=runs, seed=seed, epochs=20)
-    judgements = {name: one.judge() for name, one in zip(FILTERS, found, strict=True)}
+    setups = [replace(base, estimator=estimator) for estimator in FILTERS.values()]
+    statistics = montecarlo.run(flight, setups, runs=runs, seed=seed, epochs=20)
+    judgements = {name: result.judge() for name, result in zip(FILTERS, statistics, strict=True)}
     plan = montecarlo.Plan(scenario=flight, setup=base, seed=seed, epochs=20)
-    one = montecarlo.replay(plan, 0, machine="scalar")
-    table = filters.compare(one.record, base.process_noise, one.initial, filters=["mekf", textbook])
+    replayed = montecarlo.replay(plan, 0, machine="scalar")
+    table = filters.compare(replayed.record, base.process_noise, replayed.initial, filters=["mekf", textbook])
     if out is not None:
         Path(out).mkdir(parents=True, exist_ok=True)
-        write_json(Path(out) / "own_filter.json", {name: one.summary() for name, one in judgements.items()})
+        write_json(Path(out) / "own_filter.json", {name: judgement.summary() for name, judgement in judgements.items()})
     return Result(
-        statistics=dict(zip(FILTERS, found, strict=True)),
-        verdicts={name: one.words for name, one in judgements.items()},
+        statistics=dict(zip(FILTERS, statistics, strict=True)),
+        verdicts={name: judgement.words for name, judgement in judgements.items()},
         comparison=str(table),
     )
 

@@ -119,16 +119,16 @@ class AidedIns:
             ignore_bias_acc=True,
             cold_start=False,
         )
-        given = samples(record)
-        angles = euler(given.attitude).angles
-        q, b, P = np.empty((given.number, 4)), np.empty((given.number, 3)), np.empty((given.number, 6, 6))
-        for k in range(given.number):
+        data = samples(record)
+        angles = euler(data.attitude).angles
+        q, b, P = np.empty((data.number, 4)), np.empty((data.number, 3)), np.empty((data.number, 6, 6))
+        for k in range(data.number):
             aid: dict[str, Any] = {}
-            if (j := given.aided.get(k)) is not None:
+            if (j := data.aided.get(k)) is not None:
                 variance = (HEADING / np.cos(angles[j, 1])) ** 2
                 aid = {"head": angles[j, 0], "head_var": variance, "head_degrees": False}
-                aid |= {"vel": given.velocity[k], "vel_var": np.full(3, VELOCITY**2)}
-            ins.update(given.force[k], given.rates[k], **aid)
+                aid |= {"vel": data.velocity[k], "vel_var": np.full(3, VELOCITY**2)}
+            ins.update(data.force[k], data.rates[k], **aid)
             q[k], b[k], P[k] = ins.quaternion(), ins.bias_gyro(), ins.P[6:, 6:]
         return Estimate.from_arrays(record.time[:-1], q, foreign.read_as(self.read_as, P, q), bias=b)
 
@@ -153,14 +153,14 @@ class AttiPy:
         """Return its attitude and gyro bias at all edges except the last."""
         import attipy
 
-        given = samples(record)
+        data = samples(record)
         P0 = 1e-6 * np.eye(9)
         P0[:6, :6] = initial.covariance
         ahrs = attipy.AHRS(
             RATE,
             q_nb=initial.attitude,
             bg_b=initial.bias,
-            w_b=given.rates[0] - initial.bias,
+            w_b=data.rates[0] - initial.bias,
             P=P0,
             g=STANDARD_GRAVITY,
             nav_frame="ENU",
@@ -178,15 +178,15 @@ class AttiPy:
 
             ahrs._dhdx_yaw = row
         ahrs._dx = np.zeros(9)  # version 0.0.7 shares it among all objects, and runs are in several threads
-        angles = euler(given.attitude).angles
-        q, b, P = np.empty((given.number, 4)), np.empty((given.number, 3)), np.empty((given.number, 6, 6))
+        angles = euler(data.attitude).angles
+        q, b, P = np.empty((data.number, 4)), np.empty((data.number, 3)), np.empty((data.number, 6, 6))
         q[0], b[0], P[0] = initial.attitude, initial.bias, initial.covariance
-        for k in range(1, given.number):  # a call propagates to this edge by the last reading, and stores this one
+        for k in range(1, data.number):  # a call propagates to this edge by the last reading, and stores this one
             aid: dict[str, Any] = {"v_n": None}
-            if (j := given.aided.get(k)) is not None:
-                aid = {"v_n": given.velocity[k], "v_var": np.full(3, VELOCITY**2)}
+            if (j := data.aided.get(k)) is not None:
+                aid = {"v_n": data.velocity[k], "v_var": np.full(3, VELOCITY**2)}
                 aid |= {"yaw": angles[j, 0], "yaw_var": (HEADING / np.cos(angles[j, 1])) ** 2}
-            ahrs.update(given.force[k], given.rates[k], **aid)
+            ahrs.update(data.force[k], data.rates[k], **aid)
             q[k], b[k], P[k] = ahrs.q_nb, ahrs.bg_b, ahrs.P[:6, :6]
         return Estimate.from_arrays(record.time[:-1], q, P, bias=b)
 
@@ -203,7 +203,7 @@ class Gtsam:
         """Return its attitude at all edges except the last."""
         import gtsam
 
-        given = samples(record)
+        data = samples(record)
         noise = gtsam.PreintegrationParams.MakeSharedU(STANDARD_GRAVITY)
         noise.setGyroscopeCovariance(self.angle_random_walk**2 * np.eye(3))
         noise.setAccelerometerCovariance(ACCELEROMETER**2 * np.eye(3))
@@ -212,18 +212,18 @@ class Gtsam:
         P0[:3, :3] = initial.covariance[:3, :3]
         start = gtsam.NavState(gtsam.Rot3(quaternion.to_matrix(initial.attitude)), np.zeros(3), np.zeros(3))
         ekf = gtsam.NavStateImuEKF(start, P0, noise)
-        q, P = np.empty((given.number, 4)), np.empty((given.number, 3, 3))
+        q, P = np.empty((data.number, 4)), np.empty((data.number, 3, 3))
         q[0], P[0] = initial.attitude, initial.covariance[:3, :3]
         eye, zero = np.eye(3), np.zeros((3, 3))
-        for k in range(1, given.number):
-            ekf.predict(given.rates[k - 1], given.force[k - 1 : k + 1].mean(axis=0), 1.0 / RATE)
-            if (j := given.aided.get(k)) is not None:
+        for k in range(1, data.number):
+            ekf.predict(data.rates[k - 1], data.force[k - 1 : k + 1].mean(axis=0), 1.0 / RATE)
+            if (j := data.aided.get(k)) is not None:
                 R = ekf.state().attitude().matrix()
                 H = np.hstack([zero, zero, R])
-                ekf.updateWithVector(ekf.state().velocity(), H, given.velocity[k], VELOCITY**2 * eye)
+                ekf.updateWithVector(ekf.state().velocity(), H, data.velocity[k], VELOCITY**2 * eye)
                 now = quaternion.from_matrix(ekf.state().attitude().matrix())
-                seen = quaternion.log(quaternion.multiply(quaternion.conjugate(now), given.attitude[j]))
-                ekf.updateWithVector(np.zeros(3), np.hstack([eye, zero, zero]), seen, HEADING**2 * eye)
+                turn = quaternion.log(quaternion.multiply(quaternion.conjugate(now), data.attitude[j]))
+                ekf.updateWithVector(np.zeros(3), np.hstack([eye, zero, zero]), turn, HEADING**2 * eye)
             q[k], P[k] = quaternion.from_matrix(ekf.state().attitude().matrix()), ekf.covariance()[:3, :3]
         return Estimate.from_arrays(record.time[:-1], q, P)
 
@@ -255,25 +255,25 @@ def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
     datasheet_noise = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
     noise = float(GYRO.angle_random_walk)
     scene, steady = flight(duration), flight(duration, GyroSpec(angle_random_walk=noise))
-    found: dict[str, tuple[str, scenarios.Scenario, Any]] = {
+    by_name: dict[str, tuple[str, scenarios.Scenario, Any]] = {
         "smsfusion": ("smsfusion", scene, AidedIns(datasheet_noise))
     }
-    found["AttiPy"] = ("attipy", scene, AttiPy(datasheet_noise))
-    found["AttiPy, heading's derivative mended"] = (
+    by_name["AttiPy"] = ("attipy", scene, AttiPy(datasheet_noise))
+    by_name["AttiPy, heading's derivative mended"] = (
         "attipy",
         scene,
         AttiPy(datasheet_noise, mended=True, name="attipy-mended"),
     )
-    found["GTSAM"] = ("gtsam", steady, Gtsam(noise))
+    by_name["GTSAM"] = ("gtsam", steady, Gtsam(noise))
     if importlib.util.find_spec("smsfusion") is not None:
         from smsfusion import constants
 
         datasheet = AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet")
-        found["smsfusion, noises of another sensor"] = ("smsfusion", scene, datasheet)
+        by_name["smsfusion, noises of another sensor"] = ("smsfusion", scene, datasheet)
     fixed = AidedIns(datasheet_noise, read_as="fixed", name="smsfusion-fixed")
-    found["smsfusion, covariance read as fixed"] = ("smsfusion", scene, fixed)
-    found["GTSAM, gyro with a bias"] = ("gtsam", scene, Gtsam(noise, name="gtsam-bias"))
-    return {name: case for name, case in found.items() if importlib.util.find_spec(case[0]) is not None}
+    by_name["smsfusion, covariance read as fixed"] = ("smsfusion", scene, fixed)
+    by_name["GTSAM, gyro with a bias"] = ("gtsam", scene, Gtsam(noise, name="gtsam-bias"))
+    return {name: case for name, case in by_name.items() if importlib.util.find_spec(case[0]) is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,20 +288,20 @@ class Result:
 
 def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | str | None = None) -> Result:
     """Judge the peers; JSON is written to ``out`` if it is given."""
-    given = cases(duration)
-    found, plans = {}, {}
-    for name, (_, scene, estimator) in given.items():
-        chosen = replace(
+    peers = cases(duration)
+    statistics, plans = {}, {}
+    for name, (_, scene, estimator) in peers.items():
+        filter_setup = replace(
             setup.FilterSetup.for_scenario(scene, states=False),
             attitude_sigma=1.0 * DEGREE,
             bias_sigma=BIAS,
             estimator=estimator,
         )
-        plans[name] = montecarlo.Plan(scenario=scene, setup=chosen, seed=seed, epochs=10)
-        found[name] = montecarlo.run_plan(plans[name], runs=runs)
+        plans[name] = montecarlo.Plan(scenario=scene, setup=filter_setup, seed=seed, epochs=10)
+        statistics[name] = montecarlo.run_plan(plans[name], runs=runs)
     result = Result(
-        judgements={name: one.judge() for name, one in found.items()},
-        statistics=found,
+        judgements={name: result.judge() for name, result in statistics.items()},
+        statistics=statistics,
         frame_probability=_frames(plans["smsfusion"], min(runs, 20)) if "smsfusion" in plans else {},
     )
     if out is not None:
@@ -311,9 +311,11 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
             "runs": runs,
             "seed": seed,
             "duration_s": duration,
-            "peers": {one: version(one) for one in sorted({package for package, _, _ in given.values()})},
+            "peers": {package: version(package) for package in sorted({package for package, _, _ in peers.values()})},
             "error_frame_probability": result.frame_probability,
-            "cases": {name: {**rows(found[name]), **one.summary()} for name, one in result.judgements.items()},
+            "cases": {
+                name: {**rows(statistics[name]), **judgement.summary()} for name, judgement in result.judgements.items()
+            },
         }
         Path(out).mkdir(parents=True, exist_ok=True)
         write_json(Path(out) / "peer_judged.json", content)
@@ -328,8 +330,8 @@ def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
     sigma = np.sqrt(np.mean(statistics.sigma[judged] ** 2, axis=0))[:size]
     verdicts = {name: statistics.verdict(judged, name) for name in statistics.subsets}
     return {
-        "anees": {name: float(one.mean.mean()) for name, one in verdicts.items()},
-        "bounds": {name: list(one.bounds) for name, one in verdicts.items()},
+        "anees": {name: float(verdict.mean.mean()) for name, verdict in verdicts.items()},
+        "bounds": {name: list(verdict.bounds) for name, verdict in verdicts.items()},
         "rms_si": rms.tolist(),
         "sigma_si": sigma.tolist(),
     }
@@ -341,8 +343,8 @@ def table(result: Result) -> str:
         "| filter | ANEES state | attitude | bias | RMS/σ attitude x, y, z | RMS/σ bias x, y, z | verdict |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, one in result.statistics.items():
-        row = rows(one)
+    for name, statistics in result.statistics.items():
+        row = rows(statistics)
         ratio = np.array(row["rms_si"]) / np.array(row["sigma_si"])
         anees = [f"{row['anees'][part]:.3g}" if part in row["anees"] else "" for part in ("state", "attitude", "bias")]
         ratios = [", ".join(f"{x:.3g}" for x in part) for part in (ratio[:3], ratio[3:])]
@@ -378,8 +380,8 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     result = main(runs=arguments.runs, seed=arguments.seed, out=arguments.out)
     print(table(result) if result.statistics else "No peer is installed: pip install smsfusion attipy gtsam")
-    for name, one in result.judgements.items():
-        print(f"\n{name}: {one.words}")
+    for name, judgement in result.judgements.items():
+        print(f"\n{name}: {judgement.words}")
     if result.frame_probability:
         said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in result.frame_probability.items())
         print(f"\nDefinition of the attitude error in smsfusion's covariance: {said}.")

@@ -88,10 +88,10 @@ def draw(result, folder, objective):
     from strapdown.plots import tuning as drawing
 
     tuned = result.too_small
-    shown = [one.unit for one in tuned.parameters]
+    shown = [parameter.unit for parameter in tuned.parameters]
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
-    for number, one in enumerate((result.too_large, result.too_small)):
-        searches(one, shown, left, label=number == 0)
+    for number, search in enumerate((result.too_large, result.too_small)):
+        searches(search, shown, left, label=number == 0)
     left.set_title(f"{2 * len(result.too_large.starts)} searches", loc="left")
     values(result, right)
     plots.save(figure, folder / "tune_filter.png")
@@ -117,7 +117,7 @@ def searches(tuned, shown, ax, *, label):
         ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=style.CYCLE[0], linewidth=0.5, alpha=0.5)
     ax.plot(*begin, "o", color=style.VERMILION, markersize=3.5, label="start of a search" if label else None)
     ax.plot(*end, "o", color=style.BLUE, markersize=6, label="end of a search" if label else None)
-    names = [f"{one.name}, {unit.name}" for one, unit in zip(tuned.parameters, shown, strict=False)]
+    names = [f"{parameter.name}, {unit.name}" for parameter, unit in zip(tuned.parameters, shown, strict=False)]
     ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
     style.legend_above(ax, ncols=2)
 
@@ -127,14 +127,14 @@ def values(result, ax):
     from strapdown.plots.style import legend_above
 
     place = np.arange(len(FREE))
-    for shift, one, name in ((-0.12, result.too_large, "from 30 times"), (0.12, result.too_small, "from a 30th")):
-        ratio = np.array([[p.value, p.lower, p.upper] for p in one.parameters]).T / np.array(
+    for shift, search, name in ((-0.12, result.too_large, "from 30 times"), (0.12, result.too_small, "from a 30th")):
+        ratio = np.array([[p.value, p.lower, p.upper] for p in search.parameters]).T / np.array(
             list(result.truth.values())
         )
         ax.errorbar(
             place + shift, ratio[0], (ratio[0] - ratio[1], ratio[2] - ratio[0]), fmt="o", ms=4, capsize=3, label=name
         )
-    half = 1.96 * np.array([one.standard_error for one in result.too_small.parameters])
+    half = 1.96 * np.array([parameter.standard_error for parameter in result.too_small.parameters])
     ax.bar(
         place,
         np.exp(half) - np.exp(-half),
@@ -158,10 +158,10 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("results/tune_filter"))
     parser.add_argument("--starts", type=int, default=20, help="number of searches, each from a random start")
     parser.add_argument("--seed", type=int, default=1)
-    found = main(**vars(parser.parse_args()))
-    for start, one in (("30 times", found.too_large), ("a 30th", found.too_small)):
-        print(f"from {start}: {one.agreeing} of {len(one.starts)} searches agree")
-        for parameter, (name, value) in zip(one.parameters, found.truth.items(), strict=True):
+    result = main(**vars(parser.parse_args()))
+    for start, search in (("30 times", result.too_large), ("a 30th", result.too_small)):
+        print(f"from {start}: {search.agreeing} of {len(search.starts)} searches agree")
+        for parameter, (name, value) in zip(search.parameters, result.truth.items(), strict=True):
             ratio = np.array([parameter.value, parameter.lower, parameter.upper]) / value
             print(f"  {name:14s} {ratio[0]:.3f} of the truth, 95 % {ratio[1]:.3f} to {ratio[2]:.3f}: {parameter.note}")
-    print(f"held out, NIS before {found.held_out.before.nis:.4g}, after {found.held_out.after.nis:.4g}")
+    print(f"held out, NIS before {result.held_out.before.nis:.4g}, after {result.held_out.after.nis:.4g}")

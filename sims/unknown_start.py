@@ -116,11 +116,11 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
         record = scenarios.simulate(dataclasses.replace(scenario, motion=turned), seed, run)
         assert record.truth is not None
         if name.startswith("bank"):
-            found = multiple_model.run(
+            bank = multiple_model.run(
                 record, noise, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
             )
-            estimate, rows = found.estimate, found.edges
-            became_one.append(found.became_one)
+            estimate, rows = bank.estimate, bank.edges
+            became_one.append(bank.became_one)
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
             estimate = filters.run(name, record, noise, initial, every=EVERY, full_covariance=True)
