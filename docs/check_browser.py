@@ -49,22 +49,22 @@ addEventListener("load", () => {
 """
 
 
-def faults(found: dict[str, Any], width: int) -> list[str]:
+def faults(reported: dict[str, Any], width: int) -> list[str]:
     """Return what is wrong with a page."""
-    wrong = [f"the console says: {line}" for line in found["console"]]
-    if found["overflow"] > 0:
-        wrong.append(f"the page is {found['overflow']} pixels wider than the window of {width}")
-    if "first" in found:
-        if found["first"] != "not consistent":
-            wrong.append(f"one sample a step: the verdict is {found['first']!r}, not 'not consistent'")
+    wrong = [f"the console says: {line}" for line in reported["console"]]
+    if reported["overflow"] > 0:
+        wrong.append(f"the page is {reported['overflow']} pixels wider than the window of {width}")
+    if "first" in reported:
+        if reported["first"] != "not consistent":
+            wrong.append(f"one sample a step: the verdict is {reported['first']!r}, not 'not consistent'")
         for name in ("better", "small"):
-            if not found[name].startswith("cannot tell"):
-                wrong.append(f"{name}: the verdict is {found[name]!r}, not 'cannot tell'")
-        if not all(found["ink"]) or len(found["ink"]) != 3:
-            wrong.append(f"drawings are empty: {found['ink']}")
-        if found["redrawn"] != len(found["drawn"]):
-            wrong.append(f"{found['redrawn']} drawings for {len(found['drawn'])} moves of a slider")
-        quick = sorted(found["drawn"])[len(found["drawn"]) // 4]  # the machine may have other work
+            if not reported[name].startswith("cannot tell"):
+                wrong.append(f"{name}: the verdict is {reported[name]!r}, not 'cannot tell'")
+        if not all(reported["ink"]) or len(reported["ink"]) != 3:
+            wrong.append(f"drawings are empty: {reported['ink']}")
+        if reported["redrawn"] != len(reported["drawn"]):
+            wrong.append(f"{reported['redrawn']} drawings for {len(reported['drawn'])} moves of a slider")
+        quick = sorted(reported["drawn"])[len(reported["drawn"]) // 4]  # the machine may have other work
         if quick > FRAME:
             wrong.append(f"a drawing takes {quick:.0f} ms, more than {FRAME:.0f}")
     return wrong
@@ -80,8 +80,8 @@ def main() -> int:
     else:
         for name in ("index.html", "guide/coning.html"):
             for width in (1280, 500):  # the least width of a headless window
-                found = headless.reported(built / name, PROBE, width)
-                wrong += [f"{name}, {width} pixels: {fault}" for fault in faults(found, width)]
+                reported = headless.reported(built / name, PROBE, width)
+                wrong += [f"{name}, {width} pixels: {fault}" for fault in faults(reported, width)]
     print("\n".join(wrong) if wrong else f"coning.js has {size} bytes; pages as they should be")
     return int(bool(wrong))
 

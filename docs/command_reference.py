@@ -29,22 +29,32 @@ def markdown() -> str:
 
 
 def _section(command: Any) -> str:
-    hints = {**dict.fromkeys(one.name for one in command.params), **command.callback.__annotations__}
-    arguments = [one for one in command.params if one.param_type_name == "argument"]
-    options = [one for one in command.params if one.param_type_name == "option" and not one.hidden]
+    hints = {**dict.fromkeys(parameter.name for parameter in command.params), **command.callback.__annotations__}
+    arguments = [parameter for parameter in command.params if parameter.param_type_name == "argument"]
+    options = [
+        parameter for parameter in command.params if parameter.param_type_name == "option" and not parameter.hidden
+    ]
     usage = " ".join(
-        ["strapdown", command.name, *((one.metavar or one.name.upper()) for one in arguments), "[options]"]
+        [
+            "strapdown",
+            command.name,
+            *((argument.metavar or argument.name.upper()) for argument in arguments),
+            "[options]",
+        ]
     )
     parts = [f"### strapdown {command.name}", _text(command.help), f"```sh\n{usage}\n```"]
     if command.epilog:
         examples = [line.strip() for line in command.epilog.splitlines() if line.strip().startswith("strapdown")]
         parts.append("Examples:\n\n```sh\n" + "\n".join(examples) + "\n```")
     panels: dict[str, list[Any]] = {"argument": arguments}
-    for one in options:
-        panels.setdefault(getattr(one, "rich_help_panel", None) or "option", []).append(one)
+    for option in options:
+        panels.setdefault(getattr(option, "rich_help_panel", None) or "option", []).append(option)
     for title, members in panels.items():
         if members:
-            rows = [f"| {_name(one, hints[one.name])} | {_default(one)} | {_text(one.help or '')} |" for one in members]
+            rows = [
+                f"| {_name(option, hints[option.name])} | {_default(option)} | {_text(option.help or '')} |"
+                for option in members
+            ]
             parts.append("\n".join([f"| {title} | default | meaning |", "|---|---|---|", *rows]))
     return "\n\n".join(parts)
 
@@ -58,7 +68,7 @@ def _name(parameter: Any, hint: Any) -> str:
 
 def _value(hint: Any) -> str:
     """Return the placeholder of a value of an annotated type, of the only type of a union, or of the elements of a list."""
-    inner = [one for one in typing.get_args(hint) if isinstance(one, type) and one is not type(None)]
+    inner = [kind for kind in typing.get_args(hint) if isinstance(kind, type) and kind is not type(None)]
     if inner and not isinstance(hint, type):
         return _value(inner[0])
     if typing.get_origin(hint) is typing.Literal:

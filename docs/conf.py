@@ -184,8 +184,8 @@ def _linked(place: str, role: re.Match[str]) -> str:
     target = role.group(1)
     parts = place.split(".")
     scopes = ["", "strapdown.", *(".".join(parts[:k]) + "." for k in range(1, len(parts) + 1))]
-    found = next((scope + target for scope in reversed(scopes) if scope + target in _documented()), "")
-    return f":py:obj:`{target} <{found}>`" if found else f"``{target}``"
+    linked = next((scope + target for scope in reversed(scopes) if scope + target in _documented()), "")
+    return f":py:obj:`{target} <{linked}>`" if linked else f"``{target}``"
 
 
 def setup(app: Any) -> None:

@@ -31,5 +31,5 @@ def reported(page: Path, script: str, width: int, *options: str) -> dict[str, An
     title = re.search(r"<title>(\{.*?\})</title>", shown.stdout)
     if title is None:
         raise RuntimeError(f"{page}: the script did not end; standard error of the browser:\n{shown.stderr[-2000:]}")
-    found: dict[str, Any] = json.loads(title.group(1).replace("&quot;", '"').replace("&amp;", "&"))
-    return found | {"console": [line for line in shown.stderr.splitlines() if ":CONSOLE" in line]}
+    page_report: dict[str, Any] = json.loads(title.group(1).replace("&quot;", '"').replace("&amp;", "&"))
+    return page_report | {"console": [line for line in shown.stderr.splitlines() if ":CONSOLE" in line]}

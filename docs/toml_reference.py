@@ -9,16 +9,17 @@ from strapdown.scenarios.keys import Section, sections
 
 def markdown(group: str) -> str:
     """Return the sections of one group (``top``, ``motion``, ``gyro``, ``sensors``) as MyST Markdown, keys that all sensors share once."""
-    chosen = [one for one in sections() if one.group == group]
+    of_group = [section for section in sections() if section.group == group]
     if group == "sensors":
-        typed = [one for one in chosen if one.type]
-        shared = set.intersection(*({key.name for key in one.keys} for one in typed))
+        typed = [section for section in of_group if section.type]
+        shared = set.intersection(*({key.name for key in section.keys} for section in typed))
         first = tuple(key for key in typed[0].keys if key.name in shared)
         own = [
-            replace(one, keys=tuple(key for key in one.keys if not (one.type and key.name in shared))) for one in chosen
+            replace(section, keys=tuple(key for key in section.keys if not (section.type and key.name in shared)))
+            for section in of_group
         ]
-        chosen = [replace(typed[0], type="", summary="Keys of every type of sensor.", keys=first), *own]
-    return "\n\n".join(_section(one) for one in chosen)
+        of_group = [replace(typed[0], type="", summary="Keys of every type of sensor.", keys=first), *own]
+    return "\n\n".join(_section(section) for section in of_group)
 
 
 def _section(section: Section) -> str:

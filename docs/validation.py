@@ -95,9 +95,9 @@ def coning_drift() -> dict[str, Any]:
                 "ours": coning_study.measured_drift(cone, rate, table),
             }
         )
-    for one in rows:
+    for row in rows:
         for key in ("leading_term", "exact", "ours"):
-            one[f"{key}_deg_per_h"] = one.pop(key) / DEGREE_PER_HOUR
+            row[f"{key}_deg_per_h"] = row.pop(key) / DEGREE_PER_HOUR
     return {"angle_deg": 0.7, "frequency_hz": 10.0, "rate_hz": rate, "rows": rows}
 
 
@@ -108,7 +108,7 @@ def farrenkopf() -> list[dict[str, Any]]:
         steps = 200_000
         time = dt * np.arange(steps + 1)
         fixed = np.array([1.0, 0.0, 0.0])
-        seen = VectorMeasurements(
+        measured = VectorMeasurements(
             sensor="x",
             kind="direction",
             time=time[1:],
@@ -116,7 +116,7 @@ def farrenkopf() -> list[dict[str, Any]]:
             reference_f=fixed,
             sigma=sigma,
         )
-        record = ImuRecord(time=time, increments=np.zeros((steps, 3)), vectors=(seen,))
+        record = ImuRecord(time=time, increments=np.zeros((steps, 3)), vectors=(measured,))
         noise = estimation.ProcessNoise(angle_random_walk=sigma_v, rate_random_walk=sigma_u)
         start = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-4)
         P = estimation.run(record, noise, start, every=steps, full_covariance=True).covariance[-1]
@@ -151,10 +151,10 @@ def allan_values() -> list[dict[str, Any]]:
     rows = []
     for name, (multiples, published, source) in ALLAN.items():
         taus = [float(m) for m in multiples]
-        found = allan.allan_deviation(data[name], 1.0, taus=taus).deviation[0]
+        deviation = allan.allan_deviation(data[name], 1.0, taus=taus).deviation[0]
         rows += [
-            {"data": name, "tau": tau, "published": given, "ours": float(one), "source": source}
-            for tau, given, one in zip(taus, published, found, strict=True)
+            {"data": name, "tau": tau, "published": value, "ours": float(ours), "source": source}
+            for tau, value, ours in zip(taus, published, deviation, strict=True)
         ]
     return rows
 
@@ -195,12 +195,12 @@ def ukfm(runs: int) -> dict[str, Any]:
         drawn = quaternion.exp(10.0 * DEGREE * draw.standard_normal(3))
         for name, attitude in (("truth", truth[0]), ("drawn", drawn)):
             start = estimation.initial_state(attitude, attitude_sigma=10.0 * DEGREE, bias_sigma=1e-9)
-            found = estimation.run(record, noise, start, full_covariance=True)
-            e = quaternion.log(quaternion.multiply(quaternion.conjugate(found.attitude), truth))
+            estimate = estimation.run(record, noise, start, full_covariance=True)
+            e = quaternion.log(quaternion.multiply(quaternion.conjugate(estimate.attitude), truth))
             e[0] = quaternion.log(quaternion.conjugate(drawn))
             square[name].append(np.mean(e**2))
-            assert found.covariance is not None
-            nees[name].append(np.mean(consistency.nees(e[1:], found.covariance[1:, :3, :3])) / 3.0)
+            assert estimate.covariance is not None
+            nees[name].append(np.mean(consistency.nees(e[1:], estimate.covariance[1:, :3, :3])) / 3.0)
     return {
         **UKFM,
         "our_runs": runs,
@@ -221,14 +221,15 @@ def broad(path: Path) -> dict[str, Any]:
     published = json.loads(path.read_text(encoding="utf-8"))
     scores = {
         treatment: {
-            name: [float(x) for x in np.mean([one["errors"] for one in each], axis=0) / DEGREE]
+            name: [float(x) for x in np.mean([recording["errors"] for recording in each], axis=0) / DEGREE]
             for name, each in published["scores"][treatment].items()
         }
         for treatment in ("as recorded", "compensated")
     }
     as_recorded = published["scores"]["as recorded"]
     coverage = {
-        name: np.array([one["coverage"] for one in as_recorded[name]]) for name in ("strapdown", "strapdown, smoother")
+        name: np.array([recording["coverage"] for recording in as_recorded[name]])
+        for name in ("strapdown", "strapdown, smoother")
     }
     return {
         "recordings": published["recordings"],
