@@ -577,3 +577,19 @@ def test_a_backend_that_matplotlib_does_not_know_is_reported_in_one_line(tmp_pat
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("matplotlib cannot be loaded (Key backend: 'nonsense'")
     assert "correct the environment variable MPLBACKEND" in done.stdout
+
+
+@pytest.mark.parametrize("limits", [(3e-3, 6e-3), (0.8, 1.3), (1e-4, 1e3)])
+def test_a_logarithmic_axis_has_several_labels_that_are_their_values(limits):
+    figure, ax = plots.new_figure()
+    style.log_scale(ax)
+    ax.set_ylim(limits)
+    figure.canvas.draw()
+    shown = {
+        tick.get_position()[1]: tick.get_text()
+        for tick in ax.get_yticklabels()
+        if limits[0] <= tick.get_position()[1] <= limits[1]
+    }
+    assert 1 <= len(shown) <= 12
+    assert all(float(text) == pytest.approx(value) for value, text in shown.items())
+    assert len(shown) >= (1 if limits[0] == 0.8 else 2)

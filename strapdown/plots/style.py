@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from strapdown.checks import one_of
+from strapdown.checks import Array, one_of
 from strapdown.files import atomic_write
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
@@ -140,10 +140,20 @@ def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
     return written
 
 
+class _LogLocator(LogLocator):  # type: ignore[misc]
+    """Places of labels; at powers of ten only if there would be more than ten labels."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Array:
+        """Return the places, of which some may be outside of the limits."""
+        ticks = np.asarray(super().tick_values(vmin, vmax))
+        few = np.count_nonzero((ticks >= vmin) & (ticks <= vmax)) <= 10
+        return ticks if few else np.asarray(LogLocator().tick_values(vmin, vmax))
+
+
 def log_scale(ax: Axes) -> None:
-    """Make the vertical axis logarithmic, with labels in steps of 1, 2, 5: powers of ten alone may leave one label."""
+    """Make the vertical axis logarithmic, with labels in steps of 1, 2, 5 up to three decades: powers of ten may leave one label."""
     ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+    ax.yaxis.set_major_locator(_LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_locator(NullLocator())
 
