@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from strapdown.checks import Array, one_of
+from strapdown.checks import one_of
 from strapdown.files import atomic_write
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
@@ -140,14 +140,14 @@ def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
     return written
 
 
-class _LogLocator(LogLocator):  # type: ignore[misc]
+class _LogLocator(LogLocator):
     """Places of labels; at powers of ten only if there would be more than ten labels."""
 
-    def tick_values(self, vmin: float, vmax: float) -> Array:
+    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the places, of which some may be outside of the limits."""
-        ticks = np.asarray(super().tick_values(vmin, vmax))
-        few = np.count_nonzero((ticks >= vmin) & (ticks <= vmax)) <= 10
-        return ticks if few else np.asarray(LogLocator().tick_values(vmin, vmax))
+        ticks = super().tick_values(vmin, vmax)
+        few = sum(vmin <= tick <= vmax for tick in ticks) <= 10
+        return ticks if few else LogLocator().tick_values(vmin, vmax)
 
 
 def log_scale(ax: Axes) -> None:
