@@ -496,6 +496,13 @@ def test_units_in_the_help_are_those_that_are_known(run):
         assert unit in text
 
 
+def test_the_file_of_a_built_in_scenario_is_printed(succeeds, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    for name in ("cubesat", "hand-held"):
+        (tmp_path / "mine.toml").write_text(succeeds("scenarios", name), encoding="utf-8")
+        assert scenarios.load_scenario(tmp_path / "mine.toml") == scenarios.load_scenario(name)
+
+
 def test_a_statement_is_one_line_wherever_it_goes(succeeds, monkeypatch):
     """What a narrow terminal would break is whole in a file, so that a command printed in it can be copied and searched for."""
     monkeypatch.setenv("COLUMNS", "40")

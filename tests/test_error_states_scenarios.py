@@ -14,6 +14,7 @@ from strapdown.montecarlo.scalar import start
 LENGTH = {"coning": 12.0, "tumbling-satellite": 120.0, "low-orbit": 2400.0, "magnetometer-only": 5400.0, "rest": 120.0}
 """Seconds of the runs of the small study; the others are whole."""
 CALLED_FOR = {
+    "cubesat": (),
     "earth-observer": (),
     "ship": (),
     "coning": ("gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift"),

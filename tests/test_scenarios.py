@@ -20,7 +20,7 @@ REST = FIRST + '[motion]\ntype = "rest"\n'
 
 def test_the_built_in_ones_are_those_asked_for():
     moving = {"coning", "spin", "slew-vibration", "tumbling-satellite", "low-orbit", "magnetometer-only", "hand-held"}
-    assert set(scenarios.SCENARIOS) == moving | {"rest", "two-stars", "earth-observer", "ship"}
+    assert set(scenarios.SCENARIOS) == moving | {"rest", "two-stars", "earth-observer", "ship", "cubesat"}
     table = scenarios.builtin()
     assert [row[0] for row in table.rows] == list(scenarios.SCENARIOS)
     assert [note.partition(": ")[0] for note in table.notes] == list(scenarios.SCENARIOS)

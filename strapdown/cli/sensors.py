@@ -12,9 +12,14 @@ from strapdown.cli import terminal as ui
 
 
 @ui.command
-def scenarios() -> None:
-    """List the built-in scenarios."""
-    ui.show(sd.scenarios.builtin())
+def scenarios(
+    name: str | None = Argument(None, help="Built-in scenario, whose TOML file is printed as a template of your own."),
+) -> None:
+    """List the built-in scenarios, or print the TOML file of one."""
+    if name is None:
+        ui.show(sd.scenarios.builtin())
+    else:
+        ui.say(sd.scenarios.builtin_toml(name).rstrip())
 
 
 @ui.command

@@ -13,6 +13,7 @@ from strapdown.scenarios.simulation import simulate as simulate
 from strapdown.scenarios.toml import SCENARIOS as SCENARIOS
 from strapdown.scenarios.toml import as_scenario as as_scenario
 from strapdown.scenarios.toml import builtin as builtin
+from strapdown.scenarios.toml import builtin_toml as builtin_toml
 from strapdown.scenarios.toml import load_scenario as load_scenario
 from strapdown.scenarios.toml import scenario_from_toml as scenario_from_toml
 from strapdown.scenarios.toml import scenario_to_table as scenario_to_table

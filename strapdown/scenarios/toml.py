@@ -127,7 +127,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     if not path.exists():
         if path.suffix == ".toml":
             raise InputError(f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}")
-        path = BUILTIN / f"{one_of('scenario', text, SCENARIOS)}.toml"
+        path = _builtin_path(text)
     with reading.from_file(path):
         return _from_table(reading.toml(path), path.name)
 
@@ -330,6 +330,37 @@ def as_scenario(scenario: Scenario | str | os.PathLike[str]) -> Scenario:
         "give a Scenario, a built-in name, or the path of a TOML file",
     )
     return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+
+
+def _builtin_path(name: str) -> Path:
+    return BUILTIN / f"{one_of('scenario', name, SCENARIOS)}.toml"
+
+
+def builtin_toml(name: str) -> str:
+    """Return the TOML file of a built-in scenario, with its comments, as a template of your own.
+
+    Parameters
+    ----------
+    name : str
+        A name of :data:`SCENARIOS`.
+
+    Returns
+    -------
+    str
+        Text of the file.
+
+    Raises
+    ------
+    InputError
+        If the name is not known.
+
+    Examples
+    --------
+    >>> from strapdown import scenarios
+    >>> scenarios.builtin_toml("cubesat").splitlines()[0]
+    'name = "cubesat"'
+    """
+    return reading.text(_builtin_path(name))
 
 
 @functools.cache
