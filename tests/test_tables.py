@@ -100,7 +100,7 @@ def written(tmp_path_factory):
     rest = where / "rest.npy"
     np.save(rest, 1e-4 * np.random.default_rng(3).standard_normal((4000, 3)))
     (where / "lines.csv").write_text("frequency_hz,angle_deg\n10,0.1\n", encoding="utf-8")
-    toml = CliRunner().invoke(cli.app, ["simulate", "two-stars", "--show"]).output
+    toml = CliRunner().invoke(cli.app, ["scenarios", "two-stars"]).output
     (where / "short.toml").write_text(re.sub(r"duration_s = .*", "duration_s = 40.0", toml), encoding="utf-8")
     commands = {
         "coning": ["--runs", 1, "--duration", 12, "--format", "svg", "--out", where / "coning"],

@@ -47,16 +47,11 @@ def simulate(
     scenario: str = Argument(help=ui.SCENARIO),
     out: Path | None = Option(None, help="HDF5 file. Default: .h5 with the name, or the TOML file, of the scenario."),
     seed: int | None = Option(None, help="Seed. Default: that of the scenario."),
-    show: bool = Option(False, "--show", help="Print the scenario as TOML, as a template for your own, and stop."),
 ) -> None:
     """Simulate a scenario: a record with its truth."""
     from strapdown.recordings import recordfiles
 
     chosen = sd.scenarios.load_scenario(scenario)
-    toml = sd.scenarios.scenario_to_toml(chosen)
-    if show:
-        ui.say(toml)
-        return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{Path(scenario).stem}.h5")
     own = recordfiles.is_record
