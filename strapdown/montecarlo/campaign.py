@@ -142,7 +142,7 @@ class Campaign(Listed):
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
             "machine": self.machine,
-            "lanes_do_not_serve": self.reason or None,
+            "reason_for_scalar_engine": self.reason or None,
             "chunk": self.chunk,
             "version": self.version,
             "seconds": self.seconds,
