@@ -336,6 +336,15 @@ def test_an_interruption_that_a_library_turned_into_another_exception_remains_on
             raise ValueError("damage") from None
 
 
+@pytest.fixture
+def interruptible():
+    """A background job may be started with the signal ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_within_hdf5_an_interruption_waits_for_the_end(tmp_path):
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
