@@ -212,6 +212,14 @@ def test_anderson_darling_by_the_sum():
     assert statistic == pytest.approx((-250 - total / 250) * (1.0 + 0.75 / 250 + 2.25 / 250**2), rel=1e-9)
 
 
+def test_p_values_of_normal_samples_are_uniform():
+    """Each of the four formulas for the p-value has its share of these samples."""
+    samples = np.random.default_rng(13).standard_normal((3000, 100, 1))
+    p = np.array([consistency.anderson_darling(x)[1] for x in samples])
+    for level in (0.05, 0.3, 0.6, 0.8, 0.95):
+        assert np.mean(p < level) == pytest.approx(level, abs=4.0 * math.sqrt(level * (1.0 - level) / len(p)) + 0.005)
+
+
 def test_normality_sees_outliers():
     generator = np.random.default_rng(12)
     x = generator.standard_normal((500, 2))
