@@ -1,6 +1,7 @@
 """Estimates of other filters against a truth: clocks, frames and the reading of their covariance found, faults named."""
 
 import json
+import re
 import struct
 import sys
 from dataclasses import replace
@@ -297,30 +298,34 @@ def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):
 HEADING = quaternion.exp(np.array([0.0, 0.0, 2.0 * DEGREE]))
 MOUNTING = quaternion.exp(np.array([0.0, 1.5 * DEGREE, 0.0]))
 FAULTS = {
-    "too sure": ({"covariance": lambda e: e.covariance / 4.0}, "σ wrong by one factor"),
-    "too modest": ({"covariance": lambda e: e.covariance * 4.0}, "σ wrong by one factor"),
-    "fixed read as body": ({"covariance": fixed_side, "error_frame": "body"}, "covariance meant as fixed"),
-    "late": ({"time": lambda e: e.time + 0.1, "align": "none"}, "offset of the clock, delay"),
+    "too sure": ({"covariance": lambda e: e.covariance / 4.0}, "σ wrong by one factor", [2.0]),
+    "too modest": ({"covariance": lambda e: e.covariance * 4.0}, "σ wrong by one factor", [0.5]),
+    "fixed read as body": ({"covariance": fixed_side, "error_frame": "body"}, "covariance meant as fixed", [100.0]),
+    "late": ({"time": lambda e: e.time + 0.1, "align": "none"}, "offset of the clock, delay", [-100.0]),
     "heading": (
         {"attitude": lambda e: quaternion.multiply(HEADING, e.attitude)},
         "constant rotation of the fixed frame (heading, gravity)",
+        [0.0, 0.0, -2.0],
     ),
     "mounting": (
         {"attitude": lambda e: quaternion.multiply(e.attitude, MOUNTING)},
         "constant rotation of the body frame (mounting)",
+        [0.0, -1.5, 0.0],
     ),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_broken_filter_is_called_wrong_and_its_fault_is_named_first(run, fault):
-    changes, name = FAULTS[fault]
+    changes, name, size = FAULTS[fault]
     made = {key: value(run.estimate) if callable(value) else value for key, value in changes.items()}
     found = checked(run, **{"error_frame": "body", "innovations": {}, **made})
     assert found.judgement.verdict == "not consistent"
     assert found.explanations[0].name == name, [(one.name, one.p_value, one.nees) for one in found.explanations]
     assert found.explanations[0].likely
     assert abs(np.log(found.explanations[0].nees)) < np.log(1.5)
+    numbers = [float(number) for number in re.findall(r"[-+.\de]+(?=[,° ]|$)", found.explanations[0].value)]
+    np.testing.assert_allclose(numbers, size, rtol=0.1, atol=0.1)
 
 
 # ------------------------------------------------------------------------------------------------- reading and aligning
