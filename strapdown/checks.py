@@ -89,13 +89,13 @@ _NO_NUMBERS = {"b": "True or False", "S": "text", "U": "text", "c": "complex num
 def _truth_value(value: object) -> bool:
     """Return whether a value is True or False, or a sequence that contains one."""
     if isinstance(value, (list, tuple)):
-        return any(_truth_value(one) for one in value)
+        return any(_truth_value(item) for item in value)
     return isinstance(value, (bool, np.bool_))
 
 
 def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
     """Return a masked array with NaN in place of masked values, or an error; NumPy would use the values under the mask as data."""
-    if isinstance(value, (list, tuple)) and any(isinstance(one, np.ma.MaskedArray) for one in value):
+    if isinstance(value, (list, tuple)) and any(isinstance(item, np.ma.MaskedArray) for item in value):
         value = np.ma.array(value)
     if not isinstance(value, np.ma.MaskedArray):
         return value
@@ -112,9 +112,9 @@ def numbers(name: str, value: ArrayLike, *, allow_nan: bool = False) -> Array:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        given = np.asarray(_unmasked(name, value, allow_nan))
-        held = "True or False" if _truth_value(value) else _NO_NUMBERS.get(given.dtype.kind, "")
-        result = given if held else np.asarray(given, dtype=np.float64)
+        raw = np.asarray(_unmasked(name, value, allow_nan))
+        held = "True or False" if _truth_value(value) else _NO_NUMBERS.get(raw.dtype.kind, "")
+        result = raw if held else np.asarray(raw, dtype=np.float64)
     except InputError:
         raise
     except (TypeError, ValueError) as error:
@@ -183,10 +183,12 @@ def positive(name: str, value: float, *, unit: str = "") -> float:
 
 def by_axis(name: str, value: ArrayLike, remedy: str = "") -> Array:
     """Return one number for all axes, or one for each, as three (3,) above zero; ``remedy`` ends the message about a wrong shape."""
-    given = numbers(name, value)
-    if given.shape not in ((), (1,), (3,)):
-        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one per axis{remedy}")
-    return np.array([positive(f"{name}[{k}]", float(one)) for k, one in enumerate(np.broadcast_to(given, 3))])
+    components = numbers(name, value)
+    if components.shape not in ((), (1,), (3,)):
+        raise InputError(f"{name} has shape {components.shape}; give one number, or three, one per axis{remedy}")
+    return np.array(
+        [positive(f"{name}[{k}]", float(component)) for k, component in enumerate(np.broadcast_to(components, 3))]
+    )
 
 
 def fraction(name: str, value: float) -> float:
@@ -208,8 +210,8 @@ def non_negative(name: str, value: float, *, unit: str = "") -> float:
 def finite(name: str, value: float, *, unit: str = "") -> float:
     """Return ``value`` as a finite float."""
     try:
-        given = np.asarray(value)
-        if given.ndim or given.dtype.kind in _NO_NUMBERS:  # "60" in a file is an error, not a number; so is True
+        raw = np.asarray(value)
+        if raw.ndim or raw.dtype.kind in _NO_NUMBERS:  # "60" in a file is an error, not a number; so is True
             raise ValueError
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -323,7 +325,7 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
     ]  # a missing ending, such as that of a unit
     near = difflib.get_close_matches(str(value), known, n=5) or [name for name in known if value and str(value) in name]
     near = [*begun, *near]
-    near.sort(key=lambda one: ("_deg" in str(value)) != ("_deg" in one))  # names with the same unit first
+    near.sort(key=lambda candidate: ("_deg" in str(value)) != ("_deg" in candidate))  # names with the same unit first
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
 
@@ -331,11 +333,11 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
 def instance(name: str, value: object, wanted: type | tuple[type, ...], remedy: str) -> None:
     """Raise an error if a value is not of a class, or of one of several; ``remedy`` ends the message."""
     if not isinstance(value, wanted):
-        classes = " or ".join(one.__name__ for one in (wanted if isinstance(wanted, tuple) else (wanted,)))
+        classes = " or ".join(kind.__name__ for kind in (wanted if isinstance(wanted, tuple) else (wanted,)))
         raise InputError(f"{name} is {reprlib.repr(value)}, not of class {classes}; {remedy}")
 
 
-def known_keys(place: str, given: Iterable[str], known: Iterable[str]) -> None:
+def known_keys(place: str, keys: Iterable[str], known: Iterable[str]) -> None:
     """Raise an error for unknown keys that names the nearest known one."""
-    for key in given:
+    for key in keys:
         one_of(f"{place}: key", key, known)

@@ -82,12 +82,12 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 @contextlib.contextmanager
-def _together(**given: Array) -> Iterator[None]:
+def _together(**arrays: Array) -> Iterator[None]:
     """Raise an InputError if leading axes do not broadcast."""
     try:
         yield
     except ValueError:
-        shapes = " and ".join(f"{name} has shape {value.shape}" for name, value in given.items())
+        shapes = " and ".join(f"{name} has shape {value.shape}" for name, value in arrays.items())
         raise InputError(f"{shapes}; their leading axes must be equal, or 1") from None
 
 
@@ -222,7 +222,7 @@ def exp(rotation_vector: ArrayLike) -> Array:
     # sin x / x needs no series: the quotient is accurate for every x but zero.
     safe = np.where(half > 0.0, half, 1.0)
     half_sinc = 0.5 * np.where(half > 0.0, np.sin(safe) / safe, 1.0)
-    return np.stack([np.cos(half), *(half_sinc * one for one in np.moveaxis(phi, -1, 0))], axis=-1)
+    return np.stack([np.cos(half), *(half_sinc * component for component in np.moveaxis(phi, -1, 0))], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:

@@ -59,23 +59,27 @@ class Table:
 
     @property
     def _labelled(self) -> list[tuple[int, Column]]:
-        columns = [Column(one) if isinstance(one, str) else one for one in self.columns]
-        return [(k, one) for k, one in enumerate(columns) if one.label is not None]
+        columns = [Column(column) if isinstance(column, str) else column for column in self.columns]
+        return [(k, column) for k, column in enumerate(columns) if column.label is not None]
 
     @property
     def head(self) -> list[str]:
         """Headings in text."""
-        return [str(one.label) for _, one in self._labelled]
+        return [str(column.label) for _, column in self._labelled]
 
     @property
     def cells(self) -> list[list[str]]:
         """Rows as text."""
-        return [[_shown(row[k], one) for k, one in self._labelled] for row in self.rows]
+        return [[_shown(row[k], column) for k, column in self._labelled] for row in self.rows]
 
     @property
     def keys(self) -> dict[str, int]:
         """Headings in CSV, and the places of their columns."""
-        return {one.key: k for k, one in enumerate(self.columns) if isinstance(one, Column) and one.key is not None}
+        return {
+            column.key: k
+            for k, column in enumerate(self.columns)
+            if isinstance(column, Column) and column.key is not None
+        }
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -223,19 +227,19 @@ class ByValue:
         return hash(tuple(field.name for field in dataclasses.fields(self)))  # type: ignore[arg-type]
 
 
-def equal(one: Any, other: Any) -> bool:
+def equal(first: Any, other: Any) -> bool:
     """Return whether two values are equal: arrays by their elements, NaN equal to NaN, sequences and mappings by their contents."""
-    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-        a, b = np.asarray(one), np.asarray(other)
+    if isinstance(first, np.ndarray) or isinstance(other, np.ndarray):
+        a, b = np.asarray(first), np.asarray(other)
         return np.array_equal(a, b, equal_nan=a.dtype.kind == "f" and b.dtype.kind == "f")
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return set(one) == set(other) and all(equal(one[name], other[name]) for name in one)
-    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
-        return len(one) == len(other) and all(map(equal, one, other))
-    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+    if isinstance(first, Mapping) and isinstance(other, Mapping):
+        return set(first) == set(other) and all(equal(first[name], other[name]) for name in first)
+    if isinstance(first, (list, tuple)) and isinstance(other, (list, tuple)):
+        return len(first) == len(other) and all(map(equal, first, other))
+    if isinstance(first, float) and isinstance(other, float) and math.isnan(first):
         return math.isnan(other)
-    if isinstance(one, types.MethodType) and isinstance(
+    if isinstance(first, types.MethodType) and isinstance(
         other, types.MethodType
     ):  # Python compares their objects by identity
-        return one.__func__ is other.__func__ and bool(one.__self__ == other.__self__)
-    return bool(one == other)
+        return first.__func__ is other.__func__ and bool(first.__self__ == other.__self__)
+    return bool(first == other)

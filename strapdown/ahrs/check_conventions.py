@@ -179,7 +179,10 @@ class Examination:
         names = list(self.candidates[0].misfit)
         columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
         columns += [Column(short(name), shown="{:.3f}".format) for name in names]
-        rows = [(plain_words(one.words), one.score, *one.misfit.values()) for one in self.candidates[:8]]
+        rows = [
+            (plain_words(candidate.words), candidate.score, *candidate.misfit.values())
+            for candidate in self.candidates[:8]
+        ]
         title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
         return Table(title, columns, rows)
 
@@ -226,15 +229,15 @@ def examine(recording: Recording) -> Examination:
     doubts += _too_fast(recording) + stuck
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
-    found = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
+    explanations = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
     notes = _unseen(recording)
-    if found is None:
+    if explanations is None:
         reason = "the recording has hardly any rotation, or too few samples"
         result = Examination(
             source=recording.source, verdict="cannot tell", reason=reason, candidates=(), notes=tuple(notes)
         )
     else:
-        result = _concluded(recording.source, found, unit_changes, notes)
+        result = _concluded(recording.source, explanations, unit_changes, notes)
         if stuck:
             result = replace(result, verdict="cannot tell", reason="a gyro axis is stuck; see the warning")
     if upright and result.verdict == "as declared":
@@ -257,21 +260,21 @@ class _Explanations(NamedTuple):
     """m₀ of each relation."""
 
 
-def _concluded(source: str, found: _Explanations, sure: tuple[str, ...], notes: list[str]) -> Examination:
-    fit = np.sum([_score(values, found.floors[name]) for name, values in found.misfit.items()], axis=0)
-    score = fit - PENALTY * found.number
+def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], notes: list[str]) -> Examination:
+    fit = np.sum([_score(values, explanations.floors[name]) for name, values in explanations.misfit.items()], axis=0)
+    score = fit - PENALTY * explanations.number
     order = np.argsort(-score, kind="stable")
     named = order[0] if score[order[0]] - score[0] >= MARGIN else 0
     equal = [k for k in order[fit[order] > fit[named] - MARGIN] if k != named]
     best = [
         Candidate(
-            changes=(*found.changes(k), *sure),
+            changes=(*explanations.changes(k), *sure),
             score=float(score[k]) - PENALTY * len(sure),
-            misfit={name: float(values[k]) for name, values in found.misfit.items()},
+            misfit={name: float(values[k]) for name, values in explanations.misfit.items()},
         )
         for k in order[:12]
     ]
-    words = "; ".join((*found.changes(named), *sure))
+    words = "; ".join((*explanations.changes(named), *sure))
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best[0].misfit.values()) > POOR:
         verdict = "cannot tell"
@@ -285,7 +288,7 @@ def _concluded(source: str, found: _Explanations, sure: tuple[str, ...], notes: 
         verdict = "wrong convention" if words else "as declared"
         reason = words or "no change explains the recording better than its declared conventions"
     if equal and verdict != "cannot tell":
-        others = ("; ".join((*found.changes(k), *sure)) or NO_CHANGE for k in equal)
+        others = ("; ".join((*explanations.changes(k), *sure)) or NO_CHANGE for k in equal)
         notes = [*notes, "fits as well: " + " / ".join(others)]
     return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(best), notes=tuple(notes))
 
@@ -306,10 +309,10 @@ def at_rest(recording: Recording) -> list[str]:
     The sensors of a body whose z axis points down agree with each other, and so do those of a unit with an inverted accelerometer; the
     attitude is then in error by 180°. With a reference attitude the error is found by :func:`examine`.
     """
-    seen = None if recording.true_attitude is not None else _resting(recording)
-    if seen is None:
+    resting = None if recording.true_attitude is not None else _resting(recording)
+    if resting is None:
         return []
-    upward, reading, dip = seen
+    upward, reading, dip = resting
     reads = f"at rest the accelerometer reads {reading:.3g} m/s² along z"
     if dip is not None and dip < -MIN_DIP:
         field = (
@@ -489,12 +492,12 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     side_by_side, used = np.zeros((len(time), WIDTH)), {}
     for name, (vectors, _, strength) in sensors.items():
         samples = vectors[rows]
-        seen = np.isfinite(lengths(samples)) & known & (strength > 0.0)
-        full = np.flatnonzero(np.bincount(window[seen], minlength=len(turning)) >= least)
-        chosen = np.zeros(len(turning), bool)
-        chosen[full[np.argsort(-turning[full])][:WINDOWS]] = True
-        if chosen.any():
-            used[name] = seen & chosen[window]
+        has_sample = np.isfinite(lengths(samples)) & known & (strength > 0.0)
+        full = np.flatnonzero(np.bincount(window[has_sample], minlength=len(turning)) >= least)
+        fastest = np.zeros(len(turning), bool)
+        fastest[full[np.argsort(-turning[full])][:WINDOWS]] = True
+        if fastest.any():
+            used[name] = has_sample & fastest[window]
             columns = slice(3 * len(used) - 3, 3 * len(used))
             np.copyto(side_by_side[:, columns], samples / strength, where=used[name][:, None])
     if not used:
@@ -502,7 +505,7 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     evaluated = np.bincount(window[np.any([*used.values()], axis=0)], minlength=len(turning)) > 0
     kept = np.flatnonzero(evaluated[window] & known)
     begin = np.flatnonzero(np.diff(window[kept], prepend=-1))
-    counts = {name: np.add.reduceat(one[kept], begin, dtype=int) for name, one in used.items()}
+    counts = {name: np.add.reduceat(samples_used[kept], begin, dtype=int) for name, samples_used in used.items()}
     return _Windows(step * kept, np.append(begin, len(kept)), side_by_side[kept], counts)
 
 
@@ -552,8 +555,8 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
     first = first[known[first] & known[first + step]]
     turn = _turns_between(recording, first, first + step)
-    chosen = np.sort(np.argsort(-lengths(turn))[:MAX_TURNS])
-    return first[chosen], first[chosen] + step, turn[chosen]
+    largest = np.sort(np.argsort(-lengths(turn))[:MAX_TURNS])
+    return first[largest], first[largest] + step, turn[largest]
 
 
 def _turns_between(recording: Recording, first: np.ndarray, last: np.ndarray) -> Array:
@@ -604,14 +607,14 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
     number = np.add.outer([len(common) for common in commons], [0] * columns + [1] * len(alike))
     settings, misfit = {}, {}
     for (name, values), choice in zip(parts.items(), combinations, strict=True):
-        changed = np.array([len(one) for one in _settings(name)])
+        changed = np.array([len(changes) for changes in _settings(name)])
         best = np.argsort(PENALTY * changed - _score(values, floors[name]), axis=1, kind="stable")[:, :3]
         best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, choice]  # as declared comes first, and once
         number[:, :columns] += changed[best]
         whole = np.array(alike, int) * (len(changed) // len(AXES))
         settings[name] = np.hstack([best, np.tile(whole, (len(commons), 1))])
         misfit[name] = np.take_along_axis(values, settings[name], axis=1)
-    kept = np.flatnonzero(np.all([one >= 0 for one in settings.values()], axis=0))
+    kept = np.flatnonzero(np.all([setting >= 0 for setting in settings.values()], axis=0))
 
     def changes(k: int) -> tuple[str, ...]:
         common, column = divmod(int(kept[k]), number.shape[1])
@@ -660,8 +663,8 @@ def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations
     turns = factors * _turns_between(recording, rows, np.append(rows[1:], rows[-1]))
     attitudes = coning.integrate(turns.reshape(-1, 3))[:-1].reshape(len(factors), -1, 4)
     which, axes, changes = _one_wrong(tuple(windows.counts))
-    vectors = {name: _turned(one)[which, axes[name]] for name, one in windows.means(attitudes).items()}
-    number = np.array([len(one) for one in changes])
+    vectors = {name: _turned(mean)[which, axes[name]] for name, mean in windows.means(attitudes).items()}
+    number = np.array([len(change) for change in changes])
     misfit = _fixed_misfits(vectors)
     return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))
 
@@ -669,17 +672,17 @@ def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations
 @functools.cache
 def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray], list[tuple[str, ...]]]:
     """Return explanations with one wrong sensor: which attitude by the gyro, which axes of each vector, and the changes."""
-    found = []
+    rows = []
     place = {matrix.tobytes(): k for k, matrix in enumerate(AXES)}
     for which, sign in enumerate((1.0, -1.0) * len(GYRO_UNITS)):
         for k, matrix in enumerate(AXES):
             if np.linalg.det(matrix) * sign > 0.0:
                 changes = _settings("gyro")[k * len(GYRO_UNITS) + which // 2]
-                found.append((which, [place[(sign * matrix.T + 0.0).tobytes()]] * len(names), changes))
+                rows.append((which, [place[(sign * matrix.T + 0.0).tobytes()]] * len(names), changes))
             if k and which == 0:
                 for name in names:
-                    found.append((which, [k * (other == name) for other in names], _settings(name)[k]))
-    attitudes, axes, words = zip(*found, strict=True)
+                    rows.append((which, [k * (other == name) for other in names], _settings(name)[k]))
+    attitudes, axes, words = zip(*rows, strict=True)
     return np.array(attitudes), dict(zip(names, np.transpose(axes), strict=True)), list(words)
 
 
@@ -688,9 +691,9 @@ def _fixed_misfits(vectors: dict[str, Array]) -> dict[str, Array]:
     length = {name: lengths(v) for name, v in vectors.items()}
     misfit = {f"gyro and {name}": np.maximum(0.0, 1.0 - np.mean(size, axis=-1)) for name, size in length.items()}
     if len(vectors) == 2:
-        one, other = vectors
-        rows = min(length[one].shape[-1], length[other].shape[-1])
-        product = np.sum(vectors[one][..., :rows, :] * vectors[other][..., :rows, :], axis=-1)
-        cosine = product / np.maximum(length[one][..., :rows] * length[other][..., :rows], 1e-12)
-        misfit[f"{one} and {other}"] = 3.0 * np.var(cosine, axis=-1)  # two unrelated directions: 1/3
+        first, other = vectors
+        rows = min(length[first].shape[-1], length[other].shape[-1])
+        product = np.sum(vectors[first][..., :rows, :] * vectors[other][..., :rows, :], axis=-1)
+        cosine = product / np.maximum(length[first][..., :rows] * length[other][..., :rows], 1e-12)
+        misfit[f"{first} and {other}"] = 3.0 * np.var(cosine, axis=-1)  # two unrelated directions: 1/3
     return misfit

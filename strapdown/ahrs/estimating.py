@@ -158,11 +158,11 @@ def estimate(
     options = _Options(gate, robust, smooth, full_covariance)
     filtered, disagreement = _run(prepared, parameters, faults.turn_variance, at_rest, options)
     scales = regions.scales(filtered, parameters, disagreement=disagreement)
-    found = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
+    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
-        estimate=found,
+        estimate=at_stamps,
         calibration=None if scale is None else with_gyro_states(calibration, scale, delays.last_field, used.source),
         record=prepared.record,
         initial=prepared.initial,
@@ -221,9 +221,9 @@ def _run(
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
         spans = [estimation.Span(last, functools.partial(changed, edge=last)) for last in bounds[1:]]
-        found = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
+        online = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
-        return replace(found, events=tuple(one for one in found.events if one.kind != "gap")), None
+        return replace(online, events=tuple(event for event in online.events if event.kind != "gap")), None
     shared = Options(full_covariance=True, error_state_covariance=False, **judged)
     parts: list[Estimate] = []
     forward: list[Array] = []

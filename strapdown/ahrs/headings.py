@@ -67,21 +67,21 @@ class Headings(NamedTuple):
 def online(steps: kernel.Steps, start: float, parameters: AhrsParameters, interval: float) -> Headings:
     """Return the heading measurements, each from the steps up to it; the first sample is at ``start``, s."""
     k = len(steps.time)
-    found = kernel.Found(np.zeros((k, 3)), np.zeros(k), np.empty((k, 2)), np.empty((k, 3)), np.empty(k))
+    out = kernel.Outputs(np.zeros((k, 3)), np.zeros(k), np.empty((k, 2)), np.empty((k, 3)), np.empty(k))
     constants = constants_of(parameters, interval)
     memory = memory_of(constants)
     memory.start[0] = start
-    compiled(kernel.heading_steps)(constants, kernel.Steps(*map(read_only, steps)), memory, found)
-    seen = found.sigma > 0.0
+    compiled(kernel.heading_steps)(constants, kernel.Steps(*map(read_only, steps)), memory, out)
+    known = out.sigma > 0.0
     vectors = VectorMeasurements(
         sensor="magnetometer",
         kind="heading",
-        time=steps.time[seen],
-        vector_b=found.direction[seen],
+        time=steps.time[known],
+        vector_b=out.direction[known],
         reference_f=NORTH,
-        sigma=found.sigma[seen],
+        sigma=out.sigma[known],
     )
-    return Headings(vectors, found.usual, found.iron, found.variance)
+    return Headings(vectors, out.usual, out.iron, out.variance)
 
 
 def constants_of(parameters: AhrsParameters, interval: float) -> kernel.Constants:
@@ -122,25 +122,27 @@ def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
     field = held(steps.field, known)
     vertical = _vertical(steps.force, interval)
     as_measured = _look(field, vertical, parameters, interval)
-    seen = as_measured
-    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(seen.usual[0, 0]), causal=False)
+    measured = as_measured
+    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(measured.usual[0, 0]), causal=False)
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
         without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval)
         odds = np.clip((as_measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
-        left = (OWN_IRON * parameters.hard_iron_sigma * seen.usual[0, 0]) ** 2 / np.maximum(
+        left = (OWN_IRON * parameters.hard_iron_sigma * measured.usual[0, 0]) ** 2 / np.maximum(
             np.sum(iron**2, axis=1), 1e-30
         )
         iron *= np.maximum(1.0 - left, 0.0)[:, None]
-        iron[lengths(iron) < hard_iron.NEGLIGIBLE * seen.usual[0, 0]] = 0.0
+        iron[lengths(iron) < hard_iron.NEGLIGIBLE * measured.usual[0, 0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
-        seen = _look(field, vertical, parameters, interval)
-    steep = np.minimum(np.abs(seen.usual[:, 1]), MAX_DIP)
-    noise = (parameters.field_disturbance / np.cos(steep)) ** 2 * (1.0 + seen.deviation / parameters.field_deviation**2)
-    direction = np.where(known[:, None], field / seen.strength[:, None], 0.0)
+        measured = _look(field, vertical, parameters, interval)
+    steep = np.minimum(np.abs(measured.usual[:, 1]), MAX_DIP)
+    noise = (parameters.field_disturbance / np.cos(steep)) ** 2 * (
+        1.0 + measured.deviation / parameters.field_deviation**2
+    )
+    direction = np.where(known[:, None], field / measured.strength[:, None], 0.0)
     vectors = _gathered(steps, direction, steps.length / noise, parameters.heading_interval)
-    return Headings(vectors, seen.usual, iron, (parameters.iron_sigma / np.cos(seen.usual[:, 1])) ** 2)
+    return Headings(vectors, measured.usual, iron, (parameters.iron_sigma / np.cos(measured.usual[:, 1])) ** 2)
 
 
 class _Look(NamedTuple):
@@ -171,15 +173,15 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
     begin = np.append(0, edge[:-1] + 1)
     total = np.add.reduceat(direction * information[:, None], begin, axis=0)
     information = np.add.reduceat(information, begin)
-    seen = information > 0.0
-    total = total[seen] / lengths(total[seen])[:, None]
+    informed = information > 0.0
+    total = total[informed] / lengths(total[informed])[:, None]
     return VectorMeasurements(
         sensor="magnetometer",
         kind="heading",
-        time=time[1:][edge][seen],
-        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][seen]), total),
+        time=time[1:][edge][informed],
+        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][informed]), total),
         reference_f=NORTH,
-        sigma=1.0 / np.sqrt(information[seen]),
+        sigma=1.0 / np.sqrt(information[informed]),
     )
 
 

@@ -105,7 +105,9 @@ class LiveAhrs:
         self._filter = estimation.LiveFilter(
             setup.process_noise,
             estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=1.0),
-            () if setup.states is None else setup.states.blocks({one.sensor: one.kind for one in self._sensors}),
+            ()
+            if setup.states is None
+            else setup.states.blocks({series.sensor: series.kind for series in self._sensors}),
             sensors=self._sensors,
         )
         sigma = ASSUMED_SIGMA if latency is None else GIVEN_SIGMA
@@ -142,7 +144,7 @@ class LiveAhrs:
         head_frame, head_end, head_length, head_time = np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1), np.zeros(1)
         of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time, np.zeros(1))
         head_steps = k_headings.Steps(*map(read_only, of_step))
-        found = k_headings.Found(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
+        heading_out = k_headings.Outputs(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
         shares = regions.shares_of(parameters, magnetometer=self.magnetometer)
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
         carried = (
@@ -162,7 +164,7 @@ class LiveAhrs:
             average_field=_routine(
                 k.average_samples, read_only(field), read_only(frame), edge, field_total, field_number
             ),
-            head=_routine(k_headings.heading_steps, constants, head_steps, memory, found),
+            head=_routine(k_headings.heading_steps, constants, head_steps, memory, heading_out),
             field_mean=_routine(
                 k.running_mean, read_only(nis), forgotten, np.array([first * weight, weight]), field_level
             ),
@@ -199,9 +201,9 @@ class LiveAhrs:
             head_end=head_end,
             head_time=head_time,
             head_start=memory.start,
-            direction=found.direction,
-            sigma=found.sigma,
-            iron_variance=found.variance,
+            direction=heading_out.direction,
+            sigma=heading_out.sigma,
+            iron_variance=heading_out.variance,
             iron=steps.iron,
             field_nis=nis,
             span_field=np.zeros((span, 3)),
@@ -238,7 +240,7 @@ class LiveAhrs:
         InputError
             If the time is not after that of the last sample, or a number of the gyro is missing or infinite. The filter is then unchanged.
         """
-        call, name, given = self._call, "time", time
+        call, name, sample = self._call, "time", time
         rate: Any = gyro
         force: Any = accelerometer
         field: Any = magnetometer
@@ -246,21 +248,21 @@ class LiveAhrs:
             raise InputError("magnetometer is given, but this filter has none; start LiveAhrs(magnetometer=True)")
         try:
             call[0] = time
-            name, given = "gyro", rate
+            name, sample = "gyro", rate
             call[1], call[2], call[3] = rate.tolist() if type(rate) is np.ndarray else rate
-            name, given = "accelerometer", force
+            name, sample = "accelerometer", force
             if force is None:
                 call[4] = call[5] = call[6] = math.nan
             else:
                 call[4], call[5], call[6] = force.tolist() if type(force) is np.ndarray else force
-            name, given = "magnetometer", field
+            name, sample = "magnetometer", field
             if field is None:
                 call[7] = call[8] = call[9] = math.nan
             else:
                 call[7], call[8], call[9] = field.tolist() if type(field) is np.ndarray else field
         except (TypeError, ValueError, OverflowError):
             raise InputError(
-                f"{name} is {given!r}; give {'one number' if name == 'time' else 'three numbers'}"
+                f"{name} is {sample!r}; give {'one number' if name == 'time' else 'three numbers'}"
             ) from None
         if math.isnan(self._rested):
             self._begin()

@@ -246,5 +246,5 @@ acceleration lasts for seconds and could be mistaken for tilt; of a vessel on wa
 
 def of_motion(motion: str, *, magnetometer: bool, smooth: bool = False) -> AhrsParameters:
     """Return the parameters of a kind of motion, with a magnetometer or without, for the filter or the smoother."""
-    found = MOTIONS[one_of("motion", motion, MOTIONS)][0 if magnetometer else 1]
-    return HAND_HELD_SMOOTHED if smooth and found is HAND_HELD else found
+    parameters = MOTIONS[one_of("motion", motion, MOTIONS)][0 if magnetometer else 1]
+    return HAND_HELD_SMOOTHED if smooth and parameters is HAND_HELD else parameters

@@ -75,37 +75,37 @@ def prepare(
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
-    found = None
+    heading = None
     if recording.magnetic_field is not None:
         frame = turned
         if np.any(field_delay):
             frame = np.empty_like(turned)
             over = sensor_delays.turn_over(recording, field_delay)
             compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        field, seen = sums(recording.magnetic_field, frame, edge)
+        field, sampled = sums(recording.magnetic_field, frame, edge)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
             variance = over_steps(np.broadcast_to(turn_variance, (len(turned) - 1, 3)), edge).max(axis=1)
             variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
             rows = kernel.Steps(
-                field, seen, seen * interval, middle, total, number, turned[edge[1:]], time[1:], variance
+                field, sampled, sampled * interval, middle, total, number, turned[edge[1:]], time[1:], variance
             )
-            found = headings.online(rows, float(time[0]), parameters, max(parameters.step, interval))
+            heading = headings.online(rows, float(time[0]), parameters, max(parameters.step, interval))
         else:
             samples = headings.FieldSteps(
-                field=field / np.maximum(seen, 1.0)[:, None],
+                field=field / np.maximum(sampled, 1.0)[:, None],
                 frame=middle,
-                length=seen * interval,
+                length=sampled * interval,
                 force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
                 at_edge=turned[edge],
                 time=time,
             )
-            found = headings.smoothed(samples, parameters)
-        vectors.append(found.vectors)
+            heading = headings.smoothed(samples, parameters)
+        vectors.append(heading.vectors)
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, found)
+    return Prepared(record, initial, edge, turned, heading)
 
 
 def without_temperature(

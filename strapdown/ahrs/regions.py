@@ -44,9 +44,11 @@ def acceleration_level(filtered: Estimate, uncertain: np.ndarray, interval: floa
     The same model serves slow and fast motion, so most motion is slower than modelled. The level is set to 1 at the start, without a
     measurement, and in steps whose rotation is ``uncertain`` (k,). ``interval``: that of the steps, s.
     """
-    seen = filtered.innovations["accelerometer"]
+    innovations = filtered.innovations["accelerometer"]
     nis = np.ones((len(filtered.time), 1))
-    nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
+    nis[np.searchsorted(filtered.time, innovations.time), 0] = np.where(
+        np.isfinite(innovations.nis), innovations.nis / 3.0, 1.0
+    )
     begin = np.append(0, np.flatnonzero(uncertain) + 1)
     nis[begin] = 1.0
     return np.concatenate([low_pass(part, interval / LEVEL_TIME) for part in np.split(nis, begin[1:])])[:, 0]
@@ -102,14 +104,14 @@ def disagreement(smoothed: Array, filtered: Array) -> float:
 
 def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> Array:
     """Return the mean NIS of the magnetometer (k + 1,) up to each step, or of all; without a magnetometer 0."""
-    seen = filtered.innovations.get("magnetometer")
-    if seen is None or len(seen.time) == 0:
+    innovations = filtered.innovations.get("magnetometer")
+    if innovations is None or len(innovations.time) == 0:
         return np.zeros(len(filtered.time))
-    nis = np.where(np.isfinite(seen.nis), seen.nis, 0.0)
+    nis = np.where(np.isfinite(innovations.nis), innovations.nis, 0.0)
     if not causal:
         return np.full(len(filtered.time), float(nis.mean()))
     first, weight = FIRST_LEVEL
     mean = np.empty(len(nis))
     share = parameters.heading_interval / FIELD_MEMORY
     compiled(recording_steps.running_mean)(read_only(nis), share, np.array([first * weight, weight]), mean)
-    return np.asarray(np.append(first, mean)[np.searchsorted(seen.time, filtered.time, side="right")])
+    return np.asarray(np.append(first, mean)[np.searchsorted(innovations.time, filtered.time, side="right")])

@@ -31,7 +31,7 @@ def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
         f"Fixed frame: {fixed_frame(used)}.",
         _model(motion, result),
         *delays.words,
-        *(f"{one}." for one in result.faults.words),
+        *(f"{fault}." for fault in result.faults.words),
     ]
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
@@ -44,12 +44,12 @@ def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
     return tuple(sentence for sentence in sentences if sentence.strip("."))
 
 
-def gap_words(found: list[tuple[float, float]]) -> str:
+def gap_words(intervals: list[tuple[float, float]]) -> str:
     """Return how many gaps between stamps there are, begin and length of each given, and the longest; empty without any."""
-    if not found:
+    if not intervals:
         return ""
-    begin, length = max(found, key=lambda gap: gap[1])
-    return f"Gaps between stamps: {len(found)}, the longest {length:.3g} s after {begin:.3f} s"
+    begin, length = max(intervals, key=lambda gap: gap[1])
+    return f"Gaps between stamps: {len(intervals)}, the longest {length:.3g} s after {begin:.3f} s"
 
 
 def _model(moved_by: str, result: AhrsEstimate) -> str:

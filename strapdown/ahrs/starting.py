@@ -209,25 +209,25 @@ def are_rests(time: Array, vectors: tuple[Array | None, ...], rate: Array) -> np
         halves, number = np.empty((len(turning), 2, 3)), np.empty(len(turning))
         compiled(recording_samples.halves)(read_only(samples[turning]), halves, number)
         size = lengths(halves.sum(axis=1)) / np.maximum(number, 1)
-        seen = np.asarray((number > 1) & (size > 0.0))
-        share = np.stack([np.ceil(0.5 * number[seen]), np.floor(0.5 * number[seen])], axis=1)
-        halves = halves[seen] / (share * size[seen, None])[:, :, None]
+        valid = np.asarray((number > 1) & (size > 0.0))
+        share = np.stack([np.ceil(0.5 * number[valid]), np.floor(0.5 * number[valid])], axis=1)
+        halves = halves[valid] / (share * size[valid, None])[:, :, None]
         columns = slice(3 * k, 3 * k + 3)
-        change[seen, columns] = halves[:, 1] - halves[:, 0]
-        expected[seen, columns] = -0.5 * QUIET_SPAN * np.cross(rate[turning[seen]], 0.5 * halves.sum(axis=1))
+        change[valid, columns] = halves[:, 1] - halves[:, 0]
+        expected[valid, columns] = -0.5 * QUIET_SPAN * np.cross(rate[turning[valid]], 0.5 * halves.sum(axis=1))
     rests[turning] = np.sum(expected * change, axis=1) <= 0.5 * np.sum(expected**2, axis=1)
     return rests
 
 
-def informative(found: Rests, time: Array, parameters: AhrsParameters) -> Rests:
+def informative(at_rest: Rests, time: Array, parameters: AhrsParameters) -> Rests:
     """Return those spans whose σ is below that of the bias by the spans before: a long rest is measured once, and again as it drifts."""
     variance, before, kept = parameters.bias_sigma**2, time[0], []
-    for k, (last, sigma) in enumerate(zip(found.last, found.sigma, strict=True)):
+    for k, (last, sigma) in enumerate(zip(at_rest.last, at_rest.sigma, strict=True)):
         measured = bias_variance(variance, time[last] - before, sigma, parameters)
         if measured is not None:
             variance, before = measured, time[last]
             kept.append(k)
-    return Rests(found.last[kept], found.rate[kept], found.sigma[kept])
+    return Rests(at_rest.last[kept], at_rest.rate[kept], at_rest.sigma[kept])
 
 
 def bias_variance(variance: float, since: float, sigma: float, parameters: AhrsParameters) -> float | None:
@@ -261,7 +261,7 @@ def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> est
     )
 
 
-def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) -> AhrsParameters:
+def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) -> AhrsParameters:
     """Return the smoother's parameters, which follow what a whole recording shows of the motion and of the accelerometer.
 
     σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``). If the specific
@@ -272,9 +272,9 @@ def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) ->
         variation = float(np.nanstd(lengths(recording.specific_force)))
         factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
         parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
-    if parameters.accelerometer_bias_sigma > 0.0 and len(found.last):
+    if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
         parts, part = rest_length(recording.interval)
-        rows = found.last[:, None] + np.arange(1 - parts * part, 1)
+        rows = at_rest.last[:, None] + np.arange(1 - parts * part, 1)
         force = lengths(np.nanmean(recording.specific_force[rows], axis=1))
         deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
         if deviation > MAX_DEVIATION:
@@ -282,13 +282,15 @@ def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) ->
     return parameters
 
 
-def with_all_rests(state: estimation.State, found: Rests, time: Array, parameters: AhrsParameters) -> estimation.State:
+def with_all_rests(
+    state: estimation.State, at_rest: Rests, time: Array, parameters: AhrsParameters
+) -> estimation.State:
     """Return the state at the first sample with the bias that all spans at rest show, from the last one back, as it drifts."""
-    if len(found.last) == 0:
+    if len(at_rest.last) == 0:
         return state
     walk = parameters.rate_random_walk**2
-    mean, information, after = np.zeros(3), 0.0, time[found.last[-1]]
-    for last, rate, sigma in zip(found.last[::-1], found.rate[::-1], found.sigma[::-1], strict=True):
+    mean, information, after = np.zeros(3), 0.0, time[at_rest.last[-1]]
+    for last, rate, sigma in zip(at_rest.last[::-1], at_rest.rate[::-1], at_rest.sigma[::-1], strict=True):
         information = information / (1.0 + information * walk * (after - time[last]))
         total = information + sigma**-2
         mean, information, after = (information * mean + sigma**-2 * rate) / total, total, time[last]

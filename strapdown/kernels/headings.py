@@ -115,7 +115,7 @@ class Memory(NamedTuple):
     """Sum of the directions of a heading, and of their information (4,)."""
 
 
-class Found(NamedTuple):
+class Outputs(NamedTuple):
     """Results of each step."""
 
     direction: np.ndarray
