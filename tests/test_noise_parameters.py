@@ -16,7 +16,7 @@ from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.gyro.temperature import from_table
-from strapdown.recordings import Recording, gyro_temperature
+from strapdown.recordings import Recording, broad, gyro_temperature
 from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 DT = 0.01
@@ -173,6 +173,15 @@ def test_stamps_that_stray_are_taken_for_even_and_said():
     assert abs(np.isnan(found.values[:, 0]).sum() - 100) <= 2
     with pytest.raises(InputError, match="cut the recording to a part with equal sample intervals"):
         samples._of_recording(replace(whole, time=late), "gyro", False)
+
+
+@pytest.mark.parametrize("change", [-0.3, 0.3])
+def test_the_interval_that_differs_most_is_named(change):
+    whole = at_rest(100)
+    time = whole.time + np.where(np.arange(100) > 40, change * DT, 0.0)
+    words = f"the interval after {time[40]:.6g} s is {(1.0 + change) * DT:.6g} s"
+    with pytest.raises(InputError, match=re.escape(words)):
+        broad.sample_interval(replace(whole, time=time))
 
 
 def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):
