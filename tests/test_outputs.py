@@ -195,6 +195,9 @@ def test_a_tum_trajectory_and_the_packages_own_file(case, tmp_path):
     assert lines[4].split()[0] == "1700000000.130000001"
     table = np.loadtxt(tmp_path / "x.tum")
     np.testing.assert_array_equal(table[:, 4:], estimate.attitude[:, [1, 2, 3, 0]])
+    recordings.write(estimate, tmp_path / "x.tum")  # without a recording there is no epoch
+    stamps = [line.split()[0] for line in (tmp_path / "x.tum").read_text().splitlines()[1:]]
+    assert stamps == [f"{time:.9f}" for time in estimate.time]
     write_estimate(tmp_path / "x.h5", estimate)
     np.testing.assert_array_equal(read_estimate(tmp_path / "x.h5").covariance, estimate.covariance)
 
