@@ -95,72 +95,12 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
     ) == setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"gyro_scale_sigma_pmm": 1.0}, "did you mean 'gyro_scale_sigma_ppm'"),
-        ({"gyro_scale_sigma_ppm": [1.0, 2.0]}, r"gyro_scale_sigma has shape \(2,\)"),
-        ({"gyro_scale_sigma_ppm": -5.0}, "must not be negative"),
-        ({"gyro_misalignment_sigma_mrad": [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "entries on its diagonal"),
-        ({"gyro_drift_sigma_deg_per_hour": [1.0]}, "1 entries and gyro_drift_time 0"),
-        ({"gyro_drift_sigma_deg_per_hour": [1.0], "gyro_drift_time_s": [0.0]}, r"gyro_drift_time\[0\] is 0 s"),
-        ({"gyro_force_sigma_deg_per_hour_per_g": 1.0, "gravity_f_m_per_s2": [0, 0, 0]}, "free fall"),
-        ({"sensors": 3}, "must be a table of tables"),
-        ({"sensors": {"mag": 3}}, r"sensors: mag is 3; it must be a table"),
-        ({"sensors": {"mag": {"bias_sigm": 1.0}}}, "did you mean 'bias_sigma'"),
-        ({"sensors": {"mag": {"bias_sigma": [1.0, 0.0, 1.0]}}}, "give a value above zero for every axis"),
-        ({"sensors": {"mag": {"correlated_sigma": 1.0}}}, "give both above zero"),
-        (
-            {"sensors": {"mag": {"correlated_sigma": 1.0, "correlation_time_s": 1.0, "frame": "bodi"}}},
-            "did you mean 'body'",
-        ),
-        ({"sensors": {"mag": {"varying": 1}}}, "varying is 1; it must be true or false"),
-    ],
-)
-def test_bad_tables_are_refused_with_their_place(table, words):
-    with pytest.raises(InputError, match=words) as caught:
-        optional.from_table(table, "f.toml: filter: states")
-    assert "f.toml: filter: states" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "states is {}, not of class States"),
-        (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
-        (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
-        (lambda: WHOLE.select(("gyro.scael",)), "did you mean 'gyro.scale'"),
-        (lambda: States().select(("gyro.scale",)), "no states are declared"),
-        (lambda: run(uneven(), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "equal gyro intervals"),
-        (lambda: run(simulated(duration=1.0), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "needs 100"),
-        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
-        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=[0.1, -1.0, 0.0]), r"arm_sigma\[1\] is -1 m"),
-        (lambda: error_states.GyroForce(along_sigma=0.0), "along_sigma is 0"),
-        (
-            lambda: error_states.GyroScale(scale_sigma=np.zeros(3), misalignment_sigma=np.zeros((3, 3))),
-            "scale_sigma and misalignment_sigma are both 0",
-        ),
-    ],
-)  # fmt: skip
-def test_bad_input_is_refused_with_the_remedy(make, words):
-    with pytest.raises(InputError, match=words):
-        make()
-
-
 def chosen(states, **more) -> FilterSetup:
     return FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=3e-3, states=states, **more)
 
 
 def run(record, filter_setup, **options):
     return setup.run(record, filter_setup, begun(record), **options)
-
-
-def uneven() -> ImuRecord:
-    record = simulated()
-    kept = np.r_[0:500, 501 : len(record.time)]
-    increments = np.add.reduceat(record.increments, kept[:-1], axis=0)
-    truth = Truth(attitude=record.truth.attitude[kept], bias=record.truth.bias[kept])
-    return ImuRecord(time=record.time[kept], increments=increments, vectors=record.vectors, truth=truth)
 
 
 # ---------------------------------------------------------------------------------------------- without states: the plain filter

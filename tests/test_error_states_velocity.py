@@ -19,8 +19,7 @@ from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, setup
 from strapdown.estimation.error_states import stationary_covariance
-from strapdown.estimation.model import assemble
-from strapdown.estimation.setup.states import SensorStates, States, from_table
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
@@ -230,51 +229,6 @@ def test_names_units_and_strength():
 
 
 # ------------------------------------------------------------------------------------------------------------------ bad input
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"velocity_time": 0.0, "velocity_sigma": 1.0, "acceleration_time": 1.0}, "velocity_time is 0 s"),
-        ({"velocity_time": 1.0}, "two must be above zero"),
-        ({"velocity_time": 1.0, "velocity_sigma": 1.0}, "two must be above zero"),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 3.0, "acceleration_time": 1.0},
-            "contradict each other",
-        ),
-        ({"velocity_time": 1.0, "velocity_sigma": -1.0, "acceleration_time": 1.0}, "velocity_sigma is -1"),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "position_time": np.nan},
-            "position_time is nan",
-        ),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 1.0, "position_time": 0.5},
-            "less than velocity_time and position_time imply",
-        ),
-        ({"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "strength": 0.0}, "strength is 0"),
-    ],
-)
-def test_impossible_blocks_are_refused(fields, words):
-    with pytest.raises(InputError, match=words):
-        error_states.BoundedVelocity(sensor="acc", **fields)
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"feed": [1.0, 1.0]}, "no state follows it"),
-        ({"feed": [1.0, 1.0, 1.0, 0.0]}, "a chain has at most 3"),
-        ({"feed": [1.0, 0.0], "gyro_offset": np.eye(3)[:2]}, "belongs to a chain and enters the gyro"),
-        ({"feed": [1.0, 0.0, 0.0]}, "feed"),
-    ],
-)
-def test_impossible_chains_are_refused(fields, words):
-    n = 2 if len(fields["feed"]) == 3 else len(fields["feed"])
-    given = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
-    names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    block = type("Foreign", (error_states.ErrorStates,), {**given, **names})()
-    with pytest.raises(InputError, match=words):
-        assemble((block,), {"acc": "vector"})
 
 
 # ------------------------------------------------------------------------------------------------------------------ both faces
@@ -601,17 +555,6 @@ def test_a_correction_turns_what_is_carried(passes):
     np.testing.assert_allclose(face.values[:9], state.values[:9], rtol=1e-12)
 
 
-def test_what_is_carried_must_be_alike_on_three_axes():
-    class Lopsided(error_states.BoundedVelocity):
-        @property
-        def decay(self):
-            return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
-
-    block = Lopsided(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
-    with pytest.raises(InputError, match="axes x, y and z, in this order"):
-        assemble((block,), {"acc": "vector"})
-
-
 # ------------------------------------------------------------------------------------------------------------------ setups and files
 
 TOLD = SensorStates(velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
@@ -648,20 +591,6 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
     assert whole.velocity_sigma == 0.5
     with pytest.raises(InputError, match=r"acc: velocity_time needs an accelerometer; kind 'heading'"):
         states.blocks({"acc": "heading"})
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"velocity_time_s": 0.3}, "states: sensors: acc: .*two must be above zero"),
-        ({"velocity_sigma_m_per_s": 0.3}, "states: sensors: acc: .*velocity_time is 0 s"),
-        ({"velocity_time_s": -0.3}, "velocity_time is -0.3 s"),
-        ({"velocity_sigma_m_s": 0.3}, "did you mean 'velocity_sigma_m_per_s'"),
-    ],
-)
-def test_bad_tables_are_refused(table, words):
-    with pytest.raises(InputError, match=words):
-        from_table({"sensors": {"acc": table}})
 
 
 def test_a_setup_runs_it():

@@ -868,43 +868,6 @@ def test_a_heading_seen_straight_up_says_nothing(name):
 # --------------------------------------------------------------------------------------------------------------- bad input
 
 
-def test_bad_input_is_refused():
-    rng = np.random.default_rng(20)
-    record = simulated(rng, intervals=10, measurements=3)
-    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    with pytest.raises(InputError, match="did you mean 'mahony'"):
-        filters.run("mahoni", record, BELIEF, initial)
-    given = {"kind": "direction", "time": [0.1], "vector_b": [[1.0, 0.0, 0.0]], "reference_f": [1.0, 0.0, 0.0]}
-    wrong = [
-        (VectorMeasurements(sensor="sun", sigma=0.0, **given), r"^sun: sigma\[0\] is 0 rad; a filter needs"),
-        (VectorMeasurements(sensor="sun", sigma_axes=[0.0, 1.0, 1.0], **given), r"^sun: sigma_axes\[0\] has a 0"),
-        (
-            VectorMeasurements(sensor="sun", covariance=np.diag([0.0, 1.0, 1.0]), **given),
-            r"^sun: covariance\[0\] is singular",
-        ),
-    ]
-    for name in filters.FILTERS:
-        for arguments, message in (
-            ((record, BELIEF, initial, 0), "^every is 0; it must be a whole number"),
-            ((record, BELIEF, initial, 1.5), "^every is 1.5"),
-            (("record.h5", BELIEF, initial, 1), "^record is 'record.h5', not of class ImuRecord; make it with"),
-            ((None, BELIEF, initial, 1), "^record is None, not"),
-            ((record, 1e-4, initial, 1), "^process_noise is 0.0001, not of class ProcessNoise; give"),
-            ((record, BELIEF, [1.0, 0.0, 0.0, 0.0], 1), "^initial is .*not of class State; make it with"),
-            ((record, initial, BELIEF, 1), "^process_noise is State"),
-            *(((dataclasses.replace(record, vectors=(s,)), BELIEF, initial, 1), said) for s, said in wrong),
-        ):
-            *first, every = arguments
-            with pytest.raises(InputError, match=message):
-                filters.run(name, *first, every=every)
-            if first[0] is record and every == 1 and name != "mekf":  # by the filter itself too
-                with pytest.raises(InputError, match=message):
-                    filters.FILTERS[name](*first)
-    for gains in (5, np.zeros((2, 2))):
-        with pytest.raises(InputError, match=r"^gains has shape"):
-            complementary.run(record, BELIEF, initial, gains=gains)
-
-
 @pytest.mark.parametrize("name", filters.FILTERS)
 def test_a_reference_for_each_measurement_is_taken_as_it_is(name):
     rng = np.random.default_rng(22)

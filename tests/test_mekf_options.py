@@ -7,12 +7,10 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import correlation, drawn_start, errors, resting, series_of
+from measured import correlation, drawn_start, errors, resting
 
 from strapdown import consistency, estimation, kinematics, montecarlo, motion, quaternion
-from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
@@ -388,12 +386,6 @@ def test_correlated_noise_is_decorrelated_exactly():
     assert result.innovations["f"].nis[0] == pytest.approx(nis, rel=1e-12)
     J = kinematics.right_jacobian(x)
     assert np.allclose(result.covariance[0][:3, :3], J @ P @ J.T, rtol=1e-9, atol=1e-15)
-
-
-def test_a_schedule_of_one_sigma_takes_no_noise_by_axis():
-    series = replace(series_of("s", "direction", [0.5], [[1.0, 0, 0]], [1.0, 0, 0], 0.0), sigma_axes=[1.0, 0.0, 1.0])
-    with pytest.raises(InputError, match="one sigma per sample"):
-        schedule((series,), 0.0, 1.0)
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["per axis", "covariance"])

@@ -9,7 +9,6 @@ from measured import assert_inside, drawn_start, errors, recoveries, turn_to
 from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
-from strapdown.checks import InputError
 from strapdown.estimation import gating, setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
@@ -633,24 +632,6 @@ def test_robust_smoothing_is_better_and_consistent():
     assert squares[0] < 0.7 * squares[1]
     assert squares[0] < 0.4 * squares[2]
     assert 0.7 < nees < 1.7
-
-
-BAD = {
-    "certain": (lambda: Gate(probability=1.0), "between 0 and 1"),
-    "one refusal": (lambda: Gate(recovery=1), "recovery"),
-    "no sigma": (lambda: Gate(restart_attitude_sigma=0.0), "restart_attitude_sigma"),
-    "no bias sigma": (lambda: Gate(restart_bias_sigma=0.0), "restart_bias_sigma"),
-    "unknown": (lambda: Robust(kind="hubert"), "did you mean 'huber'"),
-    "no degrees": (lambda: Robust(degrees_of_freedom=0.0), "degrees_of_freedom"),
-    "no passes": (lambda: Robust(iterations=0), "iterations"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_named(case):
-    make, words = BAD[case]
-    with pytest.raises(InputError, match=words):
-        make()
 
 
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():

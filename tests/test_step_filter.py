@@ -13,7 +13,7 @@ from measured import resting, sample, series_of
 
 from strapdown import estimation, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation import error_states, filters, multiple_model
+from strapdown.estimation import error_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
@@ -123,41 +123,6 @@ def test_the_clock_of_given_stamps_is_theirs():
     assert f.repeated == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({}, "give either dt"),
-        ({"time": 0.5}, r"time is 0.5 s, before the filter's 1 s"),
-        ({"dt": 0.1, "time": 1.1}, "give either dt"),
-        ({"dt": -0.1}, "dt is -0.1 s; it must not be negative"),
-        ({"dt": 0.1, "delta_theta": [0.0, np.nan, 0.0]}, r"delta_theta\[1\] is nan"),
-    ],
-)
-def test_steps_that_contradict_the_clock_are_refused(arguments, message):
-    f = StepFilter(NOISE, start(), time=1.0)
-    with pytest.raises(InputError, match=message):
-        f.predict(**{"delta_theta": np.zeros(3), **arguments})
-    assert f.time == 1.0
-
-
-def test_turns_that_nothing_makes_are_refused():
-    f = StepFilter(NOISE, start())
-    for turn in (1e200, -2e6):
-        with pytest.raises(InputError, match="too large for the rotation between two samples"):
-            f.predict([0.0, turn, 0.0], 0.01)
-    assert f.time == 0.0
-
-
-def test_filterpys_own_updates_are_refused():
-    f = StepFilter(NOISE, start())
-    H = np.eye(6)[:2]
-    for update in (f.update, f.predict_update):
-        with pytest.raises(InputError, match=r"series is .*not of class VectorMeasurements"):
-            update(np.array([0.5, 0.0]), lambda x: H)
-    assert np.array_equal(f.x, np.zeros(6))
-    assert f.update(sample("direction", X, X, 0.1))
-
-
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
 
 
@@ -197,22 +162,6 @@ def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(value, 
         face.update(sample("direction", value, X, 0.1, name))
     assert pickle.dumps(face.__dict__) == before
     assert face.update(sample("direction", X, X, 0.1, "mag"))
-
-
-def test_the_sensors_of_a_filter_with_error_states_can_be_named():
-    block = error_states.VectorBias(sensor="mag", bias_sigma=0.01)
-    face = StepFilter(NOISE, start(), (block,), sensors=("acc", "mag"))
-    assert face.update(sample("direction", UP, UP, 0.1, "acc"))
-    with pytest.raises(InputError, match="sensor 'up' is not known"):
-        face.update(sample("direction", UP, UP, 0.1, "up"))
-    with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
-        StepFilter(NOISE, start(), (block,), sensors=("acc", "Mag"))
-    for blocks in ((block,), ()):
-        with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
-            StepFilter(NOISE, start(), blocks, sensors="mag")
-    # Blocks that are about no sensor leave the names free.
-    free = StepFilter(NOISE, start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
-    assert free.update(sample("direction", UP, UP, 0.1, "any"))
 
 
 VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
@@ -372,86 +321,3 @@ def test_saver_and_pickle(states):
 
 
 # ------------------------------------------------------------------------------------------------------------ what is no argument
-
-SERIES = series_of("s", "direction", [0.5], [X], X, 0.1)
-RECORD = resting(SERIES)
-
-WRONG = {
-    "two sigmas": (
-        lambda: initial_state(IDENTITY, attitude_sigma=[1.0, 2.0], bias_sigma=1.0),
-        r"attitude_sigma has shape \(2,\); give one number, or three",
-    ),
-    "two bias sigmas": (
-        lambda: initial_state(IDENTITY, attitude_sigma=1.0, bias_sigma=[1.0, 2.0]),
-        r"bias_sigma has shape \(2,\)",
-    ),
-    "sigma in words": (lambda: initial_state(IDENTITY, attitude_sigma="1°", bias_sigma=1.0), "attitude_sigma is not"),
-    "a bare block": (lambda: StepFilter(NOISE, start(), UNBIASED[0]), "single declaration .*; give a tuple"),
-    "a bare block of a start": (
-        lambda: estimation.with_error_states(start(), UNBIASED[0]),
-        "single declaration .*; give a tuple",
-    ),
-    "a bare series": (lambda: replace(RECORD, vectors=SERIES), r"\(series,\)"),
-    "no series": (lambda: resting(X), r"vectors\[0\] is"),
-    "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
-}
-
-
-FACES = {
-    "estimation.run": estimation.run,
-    "estimation.smooth": estimation.smooth,
-    "StepFilter": lambda record, *given, **options: GatedStepFilter(*given, **options),
-    "estimation.observability": estimation.observability,
-    "multiple_model.run": lambda record, noise, initial, **options: multiple_model.run(record, noise, **options),
-    "filters.run": lambda *given: filters.run("mahony", *given),
-    "filters.compare": filters.compare,
-}
-WRONG_ARGUMENTS = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}
-
-
-def wants(face, name):
-    """Whether a face has an argument of that name."""
-    if name in ("gate", "robust"):
-        return "filters" not in face and face not in ("estimation.observability", "multiple_model.run")
-    return (face, name) not in {("multiple_model.run", "initial"), ("StepFilter", "record")}
-
-
-@pytest.mark.parametrize(
-    ("face", "name"), [(face, name) for face in FACES for name in WRONG_ARGUMENTS if wants(face, name)]
-)
-def test_every_face_refuses_what_is_no_argument(face, name):
-    given = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG_ARGUMENTS[name]}
-    three = [given.pop(one) for one in ("record", "process_noise", "initial")]
-    of_class = {"record": "ImuRecord", "process_noise": "ProcessNoise", "initial": "State", "gate": "Gate"}
-    message = f"^{name} is {WRONG_ARGUMENTS[name]!r}, not of class {of_class.get(name, 'Robust')}; "
-    with pytest.raises(InputError, match=message):
-        FACES[face](*three, **given)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ({"bias_sigma": [1.0, 2.0]}, r"bias_sigma has shape \(2,\); give one number, or three"),
-        ({"bias_sigma": -1.0}, "bias_sigma"),
-        ({"bias": [0.0, 1.0]}, "bias has shape"),
-    ],
-)
-def test_the_bank_names_what_it_cannot_start_with(option, words):
-    with pytest.raises(InputError, match=words):
-        multiple_model.run(RECORD, NOISE, **option)
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_no_argument_is_named(case):
-    make, words = WRONG[case]
-    with pytest.raises(InputError, match=words):
-        make()
-
-
-def test_an_algorithm_goes_by_its_name():
-    record = record_of(1.0)
-    from strapdown import coning
-
-    one = records.compress(record, "two-sample")
-    other = records.compress(record, coning.ALGORITHMS["two-sample"])
-    assert np.array_equal(one.increments, other.increments)
