@@ -735,17 +735,6 @@ def test_what_makes_no_sense_is_refused():
         covariance.analyse(dataclasses.replace(scenario, sensors=(Own(),)), BELIEF, epochs=2)
 
 
-def test_a_scenario_without_sensors_is_dead_reckoning():
-    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-7)
-    scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=100.0)
-    found = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
-        angle_random_walk=1e-4, rate_random_walk=1e-7)), epochs=1)  # fmt: skip
-    t = 100.0
-    expected = 2e-3**2 + (2e-5 * t) ** 2 + 1e-8 * t + 1e-14 * t**3 / 3.0
-    assert np.allclose(np.diag(found.covariance[-1])[:3], expected, rtol=1e-9)
-    assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
-
-
 def test_axes_of_a_gyro_may_differ():
     """Without sensors and at rest, each axis by itself: white noise and random walk over one step a second or one in ten."""
     arw, rrw, t = np.array([1e-5, 3e-5, 6e-5]), np.array([2e-6, 0.5e-6, 1e-6]), 100.0
