@@ -6,14 +6,11 @@ import math
 
 import filterpy.common
 import in_steps
-import mpmath
 import numpy as np
 import pytest
 from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, record_of, resting, seen, series_of, turn_to
-from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
-from strapdown.checks import InputError
 from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.observability import state_names, without_errors
@@ -23,7 +20,7 @@ from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine, six_states, smoother, structure
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements, triad
+from strapdown.vectors import triad
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 
@@ -330,19 +327,6 @@ def rows_at(face, sensor, kind, reference, z, transverse):
 # -------------------------------------------------------------------------------------------------------------- sharp, diffuse, long
 
 
-@pytest.mark.parametrize(
-    ("prior", "sigma", "bound"),
-    [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)],
-    ids=["1 arcsecond", "anywhere, 0.2 arcseconds"],
-)
-def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
-    """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""
-    P = diffuse(prior, sigma)
-    expected = np.diag(1.0 / (np.array([1.0, 1.0, 2.0]) / sigma**2 + 1.0 / prior**2))
-    np.testing.assert_allclose(P[:3, :3], expected, rtol=bound, atol=bound * sigma**2)
-    np.testing.assert_allclose(P[3:, 3:], np.eye(12), rtol=1e-14, atol=1e-14)
-
-
 def diffuse(prior, sigma):
     """Return the covariance after two directions at once, of a filter whose first attitude has the σ ``prior``."""
     series = tuple(
@@ -353,73 +337,6 @@ def diffuse(prior, sigma):
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=prior, bias_sigma=1.0)
     blocks = (error_states.GyroScale(scale_sigma=1.0, misalignment_sigma=1.0),)
     return estimation.run(record, NOISE, initial, blocks, full_covariance=True).whole_covariance[0]
-
-
-@pytest.mark.parametrize(("sharpness", "bound"), [(1e-6, 1e-6), (1e-3, 1e-7), (1.0, 1e-7), (1e3, 1e-7)])
-def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bound):
-    """Predictions and rows of random directions in nine states over nine decades, against 60 digits."""
-    rng = np.random.default_rng(7)
-    kernels = machine.instance(filter_kernels, STRUCTURE=structure.SIX_STATES._replace(n=9))
-    n, W, LINE, ROWS = kernels.N, kernels.W, kernels.LINE, kernels.ROWS
-    prior = np.geomspace(1e-5, 1e5, n)[rng.permutation(n)]
-    P, work = np.zeros((n, W)), np.zeros((kernels.LINES, LINE))
-    P[:, :n] = np.diag(prior**2)
-    clear_step, take_row = called(kernels.clear_step), called(kernels.take_row)
-    with mpmath.workdps(60):
-        exact_P = mpmath.matrix(P[:, :n])
-        for _ in range(6):
-            phi = np.eye(n)
-            phi[:3] += 0.1 * rng.standard_normal((3, n)) * prior[:3, None] / prior
-            noise = np.zeros((6, n))
-            noise[:, :6] = 1e-3 * rng.standard_normal((6, 6)) * prior[:6]
-            P[:, :n] = phi @ P[:, :n] @ phi.T + noise.T @ noise
-            P[:, :n] = 0.5 * (P[:, :n] + P[:, :n].T)
-            exact_P = mpmath.matrix(phi) * exact_P * mpmath.matrix(phi).T
-            exact_P += mpmath.matrix(noise).T * mpmath.matrix(noise)
-            for rows in (1, 2, 3):
-                y = rng.standard_normal(3)
-                clear_step(work.reshape(-1), 0.0)
-                x = mpmath.zeros(n, 1)
-                for r in range(rows):
-                    h = rng.standard_normal(n) / prior
-                    work[ROWS + r, :n] = h
-                    e, s = take_row(P.reshape(-1), work.reshape(-1), ROWS + r, y[r], sharpness**2, 0.0)
-                    h = mpmath.matrix(h[None])
-                    exact = (h * exact_P * h.T)[0] + mpmath.mpf(sharpness) ** 2
-                    assert abs(s / exact - 1) < bound
-                    assert abs(e - y[r] + (h * x)[0]) < bound * mpmath.sqrt(exact)
-                    K = exact_P * h.T / exact
-                    x = x + K * (y[r] - (h * x)[0])
-                    exact_P = exact_P - K * (h * exact_P)
-                step = work[kernels.STEP]
-                assert max(abs(step[i] - x[i]) / mpmath.sqrt(exact_P[i, i]) for i in range(n)) < bound
-        expected = np.array(exact_P.tolist(), np.float64)
-    sigma = np.sqrt(np.diag(expected))
-    assert np.array_equal(P[:, :n], P[:, :n].T)
-    assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1.0, 1e3])
-def test_the_covariance_stays_positive_definite(sharpness):
-    """Ten thousand predictions and updates whose σ is so many times the prior's; one of 1e-9 is refused."""
-    rng = np.random.default_rng(3)
-    edges = np.arange(10001) / 100.0
-    sensors = []
-    for name, r in (("mag", FIELD / np.linalg.norm(FIELD)), ("force", UP / 9.81)):
-        z = seen(SWAY.attitude(edges[1:]), r)
-        sensors.append(series_of(name, "vector", edges[1:], z, r, 0.03 * sharpness))
-    increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
-    record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
-    options = {"every": 100, "full_covariance": True}
-    if sharpness < 1e-8:
-        with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
-            estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options)
-        return
-    P = estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options).whole_covariance
-    assert np.array_equal(P, np.swapaxes(P, 1, 2))
-    # Of a correlation matrix eigenvalues below 1e-16 are rounding.
-    assert np.linalg.eigvalsh(correlation(P, np.sqrt(np.einsum("kii->ki", P)))).min() > -1e-14
 
 
 @pytest.mark.parametrize("option", ["all", pytest.param("a foreign block", marks=pytest.mark.slow)])
@@ -591,25 +508,6 @@ def test_the_rows_that_are_kept_do_not_change_the_filter():
         assert np.array_equal(rare.error_states[block.name].values, whole.error_states[block.name].values[::8])
 
 
-@pytest.mark.slow
-def test_a_gap_of_many_correlation_times_does_no_harm():
-    """What a coloured noise was before the gap says nothing of what it is after it; the steps within are bounded."""
-    record = record_of()
-    time = np.where(np.arange(len(record.time)) > 100, record.time + 60.0, record.time)
-    later = tuple(
-        dataclasses.replace(s, time=np.where(s.time > 2.0, s.time + 60.0, s.time)).taken(np.abs(s.time - 2.01) > 0.011)
-        for s in record.vectors[:3]
-    )
-    record = ImuRecord(time=time, increments=record.increments, vectors=later)
-    blocks = (error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2),)
-    ahead = estimation.run(record, NOISE, start(), blocks)
-    both = estimation.smooth(record, NOISE, start(), blocks)
-    assert ahead.error_states["force disturbance"].sigma[101] == pytest.approx(0.1, rel=1e-6)
-    assert np.all(np.isfinite(both.variance))
-    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
-    assert [event.kind for event in ahead.events] == ["gap"]
-
-
 # ------------------------------------------------------------------------------------------------------------------- observability
 
 
@@ -757,22 +655,3 @@ def test_the_kernels_are_compiled_once_for_a_structure():
         estimation.smooth(_laid_out_otherwise(record), NOISE, start(), others)
         assert [dispatcher.signatures for dispatcher in dispatchers] == compiled
         assert all(compiled)
-
-
-@pytest.mark.parametrize("option", ["none", pytest.param("gyro scale", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
-def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
-    """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
-    turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
-    seen = VectorMeasurements(
-        sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
-    )
-    record = resting(seen)
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
-    found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
-    correction = wide**2 / (wide**2 + sigma**2) * turn
-    assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
-    assert abs(np.linalg.norm(found.attitude[0]) - 1.0) < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
-    J = kinematics.right_jacobian(correction)
-    P = J @ J.T / (wide**-2.0 + sigma**-2.0)
-    np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

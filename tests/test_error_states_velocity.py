@@ -23,11 +23,10 @@ from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
-from strapdown.vectors import Accelerometer, VectorMeasurements
+from strapdown.vectors import Accelerometer
 
 NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=1e-4)
 HAND = waves(((1.1, 0.3, -0.4), 0.21), ((-0.4, 0.9, 0.8), 0.37, 0.4))
@@ -228,9 +227,6 @@ def test_names_units_and_strength():
     assert three.units == ("m", "m/s", "m/s²") * 3
 
 
-# ------------------------------------------------------------------------------------------------------------------ bad input
-
-
 # ------------------------------------------------------------------------------------------------------------------ both faces
 
 
@@ -327,13 +323,6 @@ def test_both_faces_agree(option, kind):
         np.testing.assert_allclose(slow.whitened[name], one.whitened, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("option", BLOCKS)
-def test_no_time_changes_nothing(option):
-    for block in BLOCKS[option]:
-        assert np.array_equal(block.transition(0.0), np.eye(block.size))
-        assert np.array_equal(block.process_noise(0.0), np.zeros((block.size, block.size)))
-
-
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
 
 
@@ -398,17 +387,6 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     sigma = np.sqrt(variance)
     assert np.max(np.abs(values - wanted) / sigma) < 1e-3 * np.max(np.abs(wanted) / sigma)
     np.testing.assert_allclose(np.einsum("kii->ki", found.whole_covariance), variance, rtol=1e-4)
-
-
-def test_the_observability_report_knows_its_states():
-    block = block_of("velocity")
-    record, _ = record_of(block)
-    found = estimation.observability(record, NOISE, start(), (block,))
-    assert found.states[6:8] == ("acc velocity velocity x", "acc velocity drive x")
-    # What pushes is felt at once; of the velocity there is what it has been pushed to.
-    assert np.all(found.start_sigma[7::2] < 0.9 * found.prior_sigma[7::2])
-    assert np.all(found.singular_values >= 0.0)
-    assert "velocity x" in str(found)
 
 
 def test_a_gap_of_many_correlation_times_forgets_the_velocity():
@@ -529,30 +507,6 @@ def test_consistency_over_many_runs(poles, smoothed):
     size = block_of(poles).size
     for part, degrees in (("attitude", 3), ("bias", 3), ("block", size), ("all", 6 + size)):
         assert_inside(found[part][:, -1].mean(), degrees, 400, 0.999)
-
-
-@pytest.mark.parametrize("passes", [1, WIDE_PASSES], ids=["once", "iterated"])
-def test_a_correction_turns_what_is_carried(passes):
-    """By an attitude of which the states know nothing, so that only the turn changes them: as the body sees them they stay the same."""
-    blocks = (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block_of("position"))
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=3e-3)
-    state = estimation.with_error_states(initial, blocks)
-    rng = np.random.default_rng(5)
-    P = state.covariance.copy()
-    root = np.eye(9) + 0.3 * rng.standard_normal((9, 9))
-    P[15:, 15:] = root @ P[15:, 15:] @ root.T
-    state = dataclasses.replace(state, covariance=P, values=rng.standard_normal(18))
-    face = StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
-    face._passes = passes
-    turn = quaternion.exp([0.5, -0.7, 0.4])
-    star = VectorMeasurements(sensor="star", kind="attitude", time=[0.0], attitude=[turn], sigma=1e-6)
-    assert face.update(star)
-    np.testing.assert_allclose(quaternion.angle_between(face.attitude, turn), 0.0, atol=1e-9)
-    R = quaternion.to_matrix(face.attitude)
-    T = np.kron(R, np.eye(3))  # the states stand axis by axis
-    np.testing.assert_allclose(face.values[9:], T @ state.values[9:], rtol=1e-12)
-    np.testing.assert_allclose(face.P[15:, 15:], T @ P[15:, 15:] @ T.T, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(face.values[:9], state.values[:9], rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------------------------ setups and files

@@ -1,5 +1,6 @@
 """The live filter against the filter over records, sample by sample: in order, late, gated, with error states, and what it refuses."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -329,3 +330,5 @@ def test_too_many_measurements_in_an_interval():
         live.update(0.09, up=(0.0, 0.1, 1.0))
     live.update(0.2, (0.0, 0.0, 0.0))
     assert before.covariance[0, 0] < live.covariance[0, 0]
+    with pytest.raises(TypeError, match="start another one from its state"):
+        pickle.dumps(live)

@@ -4,14 +4,12 @@ import functools
 import pickle
 from dataclasses import replace
 
-import in_steps
 import numpy as np
 import pytest
-from filterpy.common import Saver
 from gated_steps import GatedStepFilter
 from measured import resting, sample, series_of
 
-from strapdown import estimation, motion, quaternion, records
+from strapdown import estimation, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation.gating import Gate, Robust
@@ -62,15 +60,6 @@ def record_of(duration=2.0):
     return simulate(scenario, 5)
 
 
-def handed_over(record, initial, states=(), **options):
-    """Run the filter over a record."""
-    names = {"sensors": [s.sensor for s in record.vectors]} if states else {}
-    face = GatedStepFilter if options.keys() & {"gate", "robust"} else StepFilter
-    f = face(NOISE, initial, states, time=record.time[0], **names, **options)
-    in_steps.fed(f, record)
-    return f
-
-
 OPTIONS = {
     "plain": {},
     "gate, Student": {"gate": Gate(probability=0.9999), "robust": Robust(degrees_of_freedom=3.0)},
@@ -82,24 +71,6 @@ def begun(record, option):
     error = (1.0, 0.5, -1.0) if option == "lost" else (0.05, -0.06, 0.07)
     attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
-
-
-@pytest.mark.parametrize(
-    ("option", "states"),
-    [
-        pytest.param(option, states, marks=[] if (option, states) == ("plain", "none") else pytest.mark.slow)
-        for option in OPTIONS
-        for states in STATES
-    ],
-)
-def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
-    record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]
-    initial = begun(record, option)
-    face = handed_over(record, initial, blocks, **given)
-    estimate = estimation.run(record, NOISE, initial, blocks, **given)
-    assert quaternion.angle_between(estimate.attitude[-1], face.attitude) < (1e-9 if blocks else 1e-10)
-    if blocks:
-        assert bool(getattr(face, "events", ())) == (option == "lost")
 
 
 IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
@@ -167,19 +138,6 @@ def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(value, 
 VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-def test_a_vertical_measured_heading_is_skipped_and_counted(options):
-    f = GatedStepFilter(NOISE, start(), **options)
-    for k in range(1, 6):
-        f.predict(np.zeros(3), time=0.1 * k)
-        assert not f.update(sample("heading", UP, X, 0.1, "north"))
-    assert f.skipped == {"north": 5}
-    assert f.refused == {}
-    assert f.events == ()
-    assert f.update(sample("heading", X, X, 0.1, "north"))
-
-
 UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
 
 
@@ -231,93 +189,3 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     assert np.array_equal(f.P, P)
     with pytest.raises(IndexError):
         f.update(series, 1)
-
-
-def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
-    """Rows of NaN, with whatever else is unknown of them, and the record without these rows."""
-    record = record_of(1.0)
-    tracker = record.vectors[2]
-    gone = np.zeros(len(tracker.time), bool)
-    gone[[0, 3, 4, 9]] = True
-    measured, axes = tracker.attitude.copy(), tracker.sigma_axes.copy()
-    measured[gone, 2], axes[gone, 1] = np.nan, np.nan
-    holed = replace(tracker, attitude=measured, sigma_axes=axes)
-    others = (record.vectors[0], record.vectors[3])
-    initial = initial_state(record.truth.attitude[0], attitude_sigma=0.01, bias_sigma=3e-3)
-    runs = [
-        estimation.run(replace(record, vectors=(*others, one)), NOISE, initial, full_covariance=True)
-        for one in (holed, tracker.taken(~gone))
-    ]
-    assert runs[0].skipped == {"a": 0, "b": 0, "tracker": 4}
-    assert np.array_equal(runs[0].covariance, runs[1].covariance)
-    assert np.array_equal(runs[0].attitude, runs[1].attitude)
-    found = estimation.first_state(replace(record, vectors=(holed,)), NOISE, bias_sigma=1e-3)
-    assert quaternion.angle_between(found.attitude, record.truth.attitude[0]) < 0.2
-
-
-# ------------------------------------------------------------------------------- from part to part, and what is kept beside it
-
-
-def lost_record():
-    """A start that is off by a radian, and two directions to recover by."""
-    record = record_of(3.0)
-    record = replace(record, vectors=(record.vectors[0], record.vectors[3]))
-    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp((1.0, 0.5, -1.0)))
-    return record, initial_state(attitude, attitude_sigma=1e-2, bias_sigma=3e-3)
-
-
-def test_the_step_face_goes_on_from_a_part_as_the_record_does():
-    """The gate's whole memory goes along: a candidate between, refusals counted, and lock-outs that go on."""
-    record, initial = lost_record()
-    gate, challenged, recovered = Gate(recovery=12), 0, 0
-    whole = estimation.run(record, NOISE, initial, gate=gate)
-    (recovery,) = [event for event in whole.events if event.kind == "recovery"]
-    for cut in (5, 10, 20, 60):
-        first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
-        _, middle = estimation.run_part(first, NOISE, initial, gate=gate)
-        second, end = estimation.run_part(rest, NOISE, middle, gate=gate)
-        challenged += int(middle.gate.counts[0])
-        face = handed_over(rest, middle, gate=gate)
-        assert quaternion.angle_between(face.attitude, end.attitude) < 1e-10
-        assert np.abs(face.bias - end.bias).max() < 1e-10
-        d = np.sqrt(np.diag(end.covariance))
-        assert np.abs((face.P - end.covariance) / np.outer(d, d)).max() < 1e-9
-        judged = [event for event in second.events if event.kind != "gap"]
-        assert sorted(map(str, face.events)) == sorted(map(str, judged))
-        recovered += recovery in face.events
-    assert challenged >= 2
-    assert recovered >= 2
-
-
-@pytest.mark.parametrize("states", STATES)
-def test_saver_and_pickle(states):
-    """Before the first measurement too, and with events that come meanwhile."""
-    record, initial = lost_record()
-    options = {"gate": Gate(recovery=4)}
-    f = GatedStepFilter(NOISE, initial, STATES[states], sensors=("a", "b"), **options)
-    history = Saver(f, save_current=True)
-    for k, t in enumerate(record.vectors[0].time):
-        if t > f.time:
-            now, then = np.searchsorted(record.time, [f.time, t])
-            f.predict(record.increments[now:then].sum(axis=0), time=t)
-        for series in record.vectors:
-            f.update(replace(series, sigma=np.full(len(series.time), 2e-3)), k)
-        history.save()
-    assert {event.kind for event in f.events} >= {"recovery"}
-    assert f.refused
-    history.to_array()
-    n, m = len(record.vectors[0].time) + 1, len(f.values)
-    assert m == (9 if STATES[states] else 0)
-    assert history.P.shape == (n, 6 + m, 6 + m)
-    assert history.K.shape == (n, 6 + m, 2)
-    assert history.attitude.shape == (n, 4)
-    assert history.values.shape == (n, m)
-    copy = pickle.loads(pickle.dumps(f))
-    for one in (f, copy):
-        one.update(sample("direction", X, X, 0.5, "a"))
-    assert np.array_equal(copy.P, f.P)
-    assert np.array_equal(copy.attitude, f.attitude)
-    assert copy.events == f.events
-
-
-# ------------------------------------------------------------------------------------------------------------ what is no argument
