@@ -6,9 +6,11 @@ import math
 
 import filterpy.common
 import in_steps
+import mpmath
 import numpy as np
 import pytest
 from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, record_of, resting, seen, series_of, turn_to
+from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
 from strapdown.estimation import error_states, forward
@@ -337,6 +339,50 @@ def diffuse(prior, sigma):
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=prior, bias_sigma=1.0)
     blocks = (error_states.GyroScale(scale_sigma=1.0, misalignment_sigma=1.0),)
     return estimation.run(record, NOISE, initial, blocks, full_covariance=True).whole_covariance[0]
+
+
+@pytest.mark.parametrize(("sharpness", "bound"), [(1e-6, 1e-6), (1e-3, 1e-7), (1.0, 1e-7), (1e3, 1e-7)])
+def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bound):
+    """Predictions and rows of random directions in nine states over nine decades, against 60 digits."""
+    rng = np.random.default_rng(7)
+    kernels = machine.instance(filter_kernels, STRUCTURE=structure.SIX_STATES._replace(n=9))
+    n, W, LINE, ROWS = kernels.N, kernels.W, kernels.LINE, kernels.ROWS
+    prior = np.geomspace(1e-5, 1e5, n)[rng.permutation(n)]
+    P, work = np.zeros((n, W)), np.zeros((kernels.LINES, LINE))
+    P[:, :n] = np.diag(prior**2)
+    clear_step, take_row = called(kernels.clear_step), called(kernels.take_row)
+    with mpmath.workdps(60):
+        exact_P = mpmath.matrix(P[:, :n])
+        for _ in range(6):
+            phi = np.eye(n)
+            phi[:3] += 0.1 * rng.standard_normal((3, n)) * prior[:3, None] / prior
+            noise = np.zeros((6, n))
+            noise[:, :6] = 1e-3 * rng.standard_normal((6, 6)) * prior[:6]
+            P[:, :n] = phi @ P[:, :n] @ phi.T + noise.T @ noise
+            P[:, :n] = 0.5 * (P[:, :n] + P[:, :n].T)
+            exact_P = mpmath.matrix(phi) * exact_P * mpmath.matrix(phi).T
+            exact_P += mpmath.matrix(noise).T * mpmath.matrix(noise)
+            for rows in (1, 2, 3):
+                y = rng.standard_normal(3)
+                clear_step(work.reshape(-1), 0.0)
+                x = mpmath.zeros(n, 1)
+                for r in range(rows):
+                    h = rng.standard_normal(n) / prior
+                    work[ROWS + r, :n] = h
+                    e, s = take_row(P.reshape(-1), work.reshape(-1), ROWS + r, y[r], sharpness**2, 0.0)
+                    h = mpmath.matrix(h[None])
+                    exact = (h * exact_P * h.T)[0] + mpmath.mpf(sharpness) ** 2
+                    assert abs(s / exact - 1) < bound
+                    assert abs(e - y[r] + (h * x)[0]) < bound * mpmath.sqrt(exact)
+                    K = exact_P * h.T / exact
+                    x = x + K * (y[r] - (h * x)[0])
+                    exact_P = exact_P - K * (h * exact_P)
+                step = work[kernels.STEP]
+                assert max(abs(step[i] - x[i]) / mpmath.sqrt(exact_P[i, i]) for i in range(n)) < bound
+        expected = np.array(exact_P.tolist(), np.float64)
+    sigma = np.sqrt(np.diag(expected))
+    assert np.array_equal(P[:, :n], P[:, :n].T)
+    assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
 
 
 @pytest.mark.parametrize("option", ["all", pytest.param("a foreign block", marks=pytest.mark.slow)])
