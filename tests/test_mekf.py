@@ -110,8 +110,8 @@ def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
     seen = VectorMeasurements(
         sensor="t",
         kind="attitude",
-        time=[1.5, 2.0],
-        attitude=[np.full(4, np.nan), quaternion.multiply(q, quaternion.exp(turn))],  # the first is missing
+        time=[*np.linspace(1.0, 1.5, 11), 2.0],
+        attitude=[*np.full((11, 4), np.nan), quaternion.multiply(q, quaternion.exp(turn))],  # the first are missing
         sigma_axes=axes,
     )
     increments = np.outer([1.0, 2.0], 0.5 * turn + bias)

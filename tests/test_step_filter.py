@@ -179,7 +179,7 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
     f.predict(np.zeros(3), time=0.5)
     P = f.P.copy()
-    for value in ([np.nan] * 3, [0.0, np.nan, 1.0]):
+    for value in ([np.nan] * 3, UP if kind == "heading" else [0.0, np.nan, 1.0]):  # a vertical vector has no heading
         if kind == "attitude":
             series = VectorMeasurements(sensor="s", kind=kind, time=[0.0], attitude=[[*value, 1.0]], sigma=0.1)
         else:

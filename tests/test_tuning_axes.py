@@ -111,6 +111,8 @@ def test_names_start_from_the_present_sigma():
         tuning.with_values(chosen, {"star.sigma.y": 3e-5})
     assert tuning.unit_of("star.sigma.x", [record]).name == "arcsec"
     assert tuning.parameters.axis_of("star.sigma") is None
+    silent = dataclasses.replace(record, vectors=(dataclasses.replace(record.vectors[0], sigma_axes=np.zeros(3)),))
+    assert parameters.by_axis(twice, ["star.sigma.z"], [silent]).sigma["star"] == (2.0 * size,) * 3
     filled = parameters.by_axis(chosen, ["star.sigma.z"], [record])
     assert setup.from_toml(setup.to_toml(filled)) == filled
 
