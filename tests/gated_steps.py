@@ -1,12 +1,6 @@
-"""The step-by-step filter with gate, recovery and robust weights, the reference for those of the compiled filter.
+"""The step-by-step filter with gate, recovery and robust weights in matrices: the reference for those of the compiled filter.
 
-In matrix form, for any number of states.
-
-- :func:`linearize`: the measurement linearised at the estimate after its update (iterated update), with its NIS and its robust weight.
-- :class:`Supervision`: the counters of the gate, and the restart candidate, which runs in parallel with the filter.
-
-Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.kernels.iterated_update` and
-:mod:`strapdown.kernels.gate_rules`, whose counters run here as plain Python.
+Methods, thresholds and their reasons are those of the kernels; the counters of :mod:`strapdown.kernels.gate_rules` run here as Python.
 """
 
 from __future__ import annotations
@@ -21,11 +15,11 @@ import filterpy.kalman
 import numpy as np
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array
 from strapdown.estimation import model as modelling
 from strapdown.estimation.forward import gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
+from strapdown.estimation.states import State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import filter, gate_rules, iterated_update, machine
 from strapdown.kernels.gate_rules import WIDE_PASSES
@@ -43,8 +37,6 @@ from strapdown.kernels.iterated_update import (
 )
 from strapdown.records import Event
 from strapdown.vectors import KINDS
-
-# ------------------------------------------------------------------------------------------------------ one measurement, linearised
 
 
 class Rows(NamedTuple):
@@ -98,19 +90,12 @@ class Linearization:
         return float(self.innovation @ np.linalg.solve(self.predicted + self.rows.noise, self.innovation))
 
     def acceptable(self, threshold: float) -> bool:
-        """Return whether a gate with this threshold accepts the measurement.
-
-        A direction more than 90° from the predicted one is never accepted: its rows, transverse to the prediction, do not show its sense.
-        """
+        """Return whether a gate accepts it: never a direction more than 90° off, whose rows do not show its sense."""
         behind = len(self.rows.residual) == 2 and self.rows.angle > 0.5 * math.pi and threshold < math.inf
         return self.converged and self.nis <= threshold and not behind
 
     def correction(self, robust: Robust | None) -> tuple[Array, float]:
-        """Return the correction (n,) of one update, and the size that must fall below the tolerance.
-
-        The size comprises the attitude correction, rad, and the effect of the optional states on the decorrelated rows. The residual of a
-        direction is its arc, not its chord, so that a large update neither converges slowly nor stops at the opposite direction.
-        """
+        """Return the correction (n,), by arcs of directions, and its size: attitude, rad; optional states by their effect on the rows."""
         residual, H, noise, _, arc = self.rows
         L = np.linalg.cholesky(noise)
         L = L / np.diag(L)
@@ -149,24 +134,7 @@ def linearize(
     threshold: float,
     robust: Robust | None = None,
 ) -> Linearization:
-    """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
-
-    Parameters
-    ----------
-    model : callable
-        Rows of the measurement at a state.
-    attitude, others, P : ndarray
-        The prior: q_fb (4,), gyro bias and optional error states (n − 3,), covariance (n, n).
-    chains : ndarray
-        Of :class:`strapdown.estimation.model.Model`: which states rotate with the attitude.
-    passes : int
-        Maximum number of linearisations; 1: the plain extended Kalman filter.
-    threshold : float
-        Threshold of the gate. While the attitude is nearly unknown, a measurement that would be refused is linearised again from 120° to
-        either side about the least certain axis.
-    robust : Robust, optional
-        The point of linearisation is the result of the weighted update.
-    """
+    """Return a measurement linearised at the state after its update, from 120° to either side too while the attitude is unknown."""
     zero = np.zeros(len(P))
     seen = first = Linearization(
         attitude=attitude, others=others, covariance=P, prior=zero, rows=model(attitude, others)
@@ -206,10 +174,7 @@ def prior_at(
 
 
 def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return P of a prior (n, n) at the attitude rotated by q from its mean, and the rotation vector from there to the mean (3,), rad.
-
-    The method is that of :func:`strapdown.kernels.iterated_update.seen_from`, which gives the reasons.
-    """
+    """Return P of a prior (n, n) at the attitude rotated by q from its mean, and the rotation vector back to the mean (3,), rad."""
     A = covariance[:3, :3]
     axis = least_certain_axis(covariance)
     largest = float(axis @ A @ axis)
@@ -238,39 +203,14 @@ def tilt_unknown(attitude: Array, covariance: Array) -> bool:
     return float(np.trace(R @ covariance[:3, :3] @ R.T)) > UNKNOWN_TILT
 
 
-# -------------------------------------------------------------------------------------------------------------- the gate
-
-
-class Events:
-    """Descriptor of the ``events`` of a filter: recoveries and lock-outs up to now, in order of time.
-
-    Not a property, because filterpy's ``Saver`` converts every property to an array, and a growing tuple has no fixed shape.
-    """
-
-    def __get__(self, filter: Any, owner: type) -> Any:
-        """Return those of a filter."""
-        return self if filter is None else filter._supervision.events
-
-
 class Supervision:
     """The gate of a step-by-step filter: counters, restart candidate and the events reported up to now."""
 
-    def __init__(self, gate: Gate | None, memory: GateMemory | None) -> None:
-        self.gate = gate
-        self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.counters)
-        self.memory, self.counters = remembered(gate, memory, self.sensors)
+    def __init__(self, gate: Gate | None) -> None:
+        self.gate, self.sensors = gate, ()
+        self.memory, self.counters = remembered(gate, None, ())
         self.candidate: GatedStepFilter | None = None
         self.recoveries, self.lock_outs = np.empty((0, 4)), np.empty((0, 4))
-
-    @property
-    def has_candidate(self) -> bool:
-        """Whether a restart candidate is running; the filter itself restores a candidate of an earlier part of a record."""
-        return bool(self.memory[gate_rules.CANDIDATE])
-
-    @property
-    def passes(self) -> int:
-        """Maximum number of linearisations of an update of the filter: more than one after a recovery."""
-        return int(self.memory[gate_rules.PASSES])
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -298,7 +238,7 @@ class Supervision:
             gate_rules.recover(filter.time, s, limit, counters, memory, row, self.lock_outs)
             self.recoveries = np.vstack([self.recoveries, row])
             filter._become(self.candidate)
-            filter._passes = self.passes
+            filter._passes = int(memory[gate_rules.PASSES])
             self.candidate = None
 
     def _row_of(self, sensor: str) -> int:
@@ -338,18 +278,6 @@ class Supervision:
         gate_rules.count_widening(self.memory)
 
 
-# ------------------------------------------------------------------------------------------------------------------- the filter
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Prior:
-    """Prior of the optional error states for a restart candidate."""
-
-    time: float
-    values: Array
-    covariance: Array
-
-
 class GatedStepFilter(StepFilter):
     """:class:`strapdown.StepFilter` with a gate and robust weights; ``weight`` is that of the last measurement."""
 
@@ -360,31 +288,15 @@ class GatedStepFilter(StepFilter):
         self.weight = 1.0
         self.refused: dict[str, int] = {}
         self._thresholds = np.full(3, np.inf) if gate is None else gate.thresholds
-        self._begin_gate(modelling.begin(initial, self.error_states))
-
-    events = Events()
-
-    def _begin_gate(self, state: State) -> None:
-        """Set up the gate; if the state contains the memory of a gate and its restart candidate, continue with them."""
-        gate, memory = self.gate, state.gate
+        state = modelling.begin(initial, self.error_states)
         self._restart_bias_variance = restart_bias_variance(gate, state)
-        self._supervision: Supervision = Supervision(gate, memory)
-        self._passes = self._supervision.passes
-        values, P = restart_states(state, self.error_states)
-        self._restart_prior = _Prior(time=self.time, values=values, covariance=P)
-        if gate is None or memory is None:
-            return
-        if self.time < memory.start:
-            raise InputError(
-                f"time is {self.time:.9g} s, before the record of initial began, {memory.start:.9g} s; give the time of initial"
-            )
-        self._restart_prior = _Prior(time=memory.start, values=memory.values, covariance=memory.covariance)
-        one = memory.candidate
-        if one is not None and self._supervision.has_candidate:
-            bias, values = one.others[:3], one.others[3:]
-            self._supervision.candidate = self._candidate(
-                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance)
-            )
+        self._supervision, self._passes = Supervision(gate), 1
+        self._restart_prior = self.time, *restart_states(state, self.error_states)
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Recoveries and lock-outs up to now, in order of time."""
+        return self._supervision.events
 
     def _running(self) -> list[StepFilter]:
         """Return the filter and the restart candidate."""
@@ -450,11 +362,9 @@ class GatedStepFilter(StepFilter):
         self.P = P
 
     def _show_refused(self, seen: Linearization, unit: float) -> None:
-        """Set the attributes of filterpy's update for a refused measurement: its residual and covariance, and zero gain."""
+        """Set residual and covariance of a refused measurement."""
         self.z, self.y = unit * seen.rows.residual, unit * seen.innovation
         self.S = unit**2 * (seen.predicted + seen.rows.noise)
-        self.SI, self.K = np.linalg.inv(self.S), np.zeros((len(self.x), len(self.y)))
-        self._log_likelihood = self._likelihood = self._mahalanobis = None  # to be computed anew
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
@@ -468,8 +378,8 @@ class GatedStepFilter(StepFilter):
 
     def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
         """Return a restart candidate: optional states at their prior, attitude and bias independent of them, with the given uncertainty."""
-        prior, m = self._restart_prior, len(self.values)
-        values, Pc = modelling.aged_prior(self.error_states, prior.values, prior.covariance, self.time - prior.time)
+        (time, *prior), m = self._restart_prior, len(self.values)
+        values, Pc = modelling.aged_prior(self.error_states, *prior, self.time - time)
         P = np.zeros((6 + m, 6 + m))
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)

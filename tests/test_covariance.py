@@ -10,6 +10,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import chi2, norm
 from typer.testing import CliRunner
 
+import strapdown as sd
 from strapdown import cli, coning, consistency, covariance, montecarlo, motion, quaternion, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
@@ -735,17 +736,6 @@ def test_what_makes_no_sense_is_refused():
         covariance.analyse(dataclasses.replace(scenario, sensors=(Own(),)), BELIEF, epochs=2)
 
 
-def test_a_scenario_without_sensors_is_dead_reckoning():
-    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-7)
-    scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=100.0)
-    found = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
-        angle_random_walk=1e-4, rate_random_walk=1e-7)), epochs=1)  # fmt: skip
-    t = 100.0
-    expected = 2e-3**2 + (2e-5 * t) ** 2 + 1e-8 * t + 1e-14 * t**3 / 3.0
-    assert np.allclose(np.diag(found.covariance[-1])[:3], expected, rtol=1e-9)
-    assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
-
-
 def test_axes_of_a_gyro_may_differ():
     """Without sensors and at rest, each axis by itself: white noise and random walk over one step a second or one in ten."""
     arw, rrw, t = np.array([1e-5, 3e-5, 6e-5]), np.array([2e-6, 0.5e-6, 1e-6]), 100.0
@@ -787,38 +777,21 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
         epochs=10,
     )
     assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
+    assert np.allclose(np.array(found["rms"]["bias_deg_per_hour"]) * DEGREE / 3600.0, direct.rms[:, 3:])
     assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
     assert f"optimistic in bias: √NEES is {np.sqrt(direct.expected_nees[-1, 2]):.3g}." in " ".join(said.split())
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_takes_a_filter_and_units(succeeds, tmp_path):
-    belief = setup.FilterSetup.for_scenario(load_scenario("low-orbit"), states=False)
-    (tmp_path / "filter.toml").write_text(setup.to_toml(belief), encoding="utf-8")
-    arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--consider", "magnetometer.bias=100")
-    said = succeeds("covariance", *arguments, "--consider", "initial.attitude=2", "--consider", "initial.bias=30")
-    assert "the filter given" in said
-    found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
-    direct = covariance.analyse(
-        load_scenario("low-orbit"),
-        belief,
-        consider=Consider(sensor_bias={"magnetometer": 100e-9}),
-        initial_attitude_sigma=2.0 * DEGREE,
-        initial_bias_sigma=30.0 * DEGREE / 3600.0,
-        epochs=5,
-    )
-    assert np.allclose(found["rms"]["attitude_arcsec"], direct.rms[:, :3] / ARCSECOND)
-    assert found["rms"]["attitude_arcsec"][0][0] == pytest.approx(7200.0)
-    assert found["rms"]["bias_deg_per_hour"][0][0] == pytest.approx(30.0)
-
-
-def test_the_command_gives_no_verdict_beyond_the_linear_range(run, succeeds):
+def test_the_command_gives_no_verdict_beyond_the_linear_range(run, succeeds, tmp_path):
     said = succeeds("covariance", "rest", "--epochs", 4, "--no-states")
     assert "will be consistent" in said
     assert "linear about the truth, cannot tell whether the filter will be consistent" in said
     assert "The filter will be" not in said
     assert "Beyond linear: the attitude error itself" in said
-    _, said, _ = run("covariance", "two-stars", "--epochs", 4)
+    sd.write(sd.FilterSetup.for_scenario(load_scenario("two-stars")), tmp_path / "filter.toml")
+    _, said, _ = run("covariance", "two-stars", "--epochs", 4, "--filter", "filter.toml")
+    assert said.startswith("two-stars, the filter given")
     assert "The filter will be consistent." in said
 
 
@@ -840,16 +813,28 @@ def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch,
         pass
 
     def analysed(scenario, belief, **options):
-        raise Reached(options["consider"])
+        raise Reached(belief, options.pop("consider"), options)
 
     monkeypatch.setattr("strapdown.covariance_analysis", analysed, raising=False)
     monkeypatch.chdir(tmp_path)
-    errors = ("scale_factor=3", "misalignment=2", "g_sensitivity=7", "star.bias=4", "star.mounting=5")
-    found = CliRunner().invoke(cli.app, ["covariance", "spin", *(f"--consider={one}" for one in errors)])
-    assert isinstance(found.exception, Reached), found.output
-    (consider,) = found.exception.args
+    (tmp_path / "filter.toml").write_text(setup.to_toml(BELIEF), encoding="utf-8")
+
+    def reached(scenario, *considered):
+        arguments = ["covariance", scenario, "--filter", "filter.toml", *(f"--consider={one}" for one in considered)]
+        found = CliRunner().invoke(cli.app, arguments)
+        assert isinstance(found.exception, Reached), found.output
+        return found.exception.args
+
+    errors = ("scale_factor=3", "misalignment=2", "g_sensitivity=7", "star.bias=4", "star.mounting=5", "star.delay=6")
+    belief, consider, _ = reached("spin", *errors)
+    assert belief == BELIEF
     assert consider.scale_factor == pytest.approx(3e-6)
     assert consider.misalignment == pytest.approx(2e-3)
     assert consider.sensor_bias == {"star": pytest.approx(4.0 * ARCSECOND)}
     assert consider.mounting == {"star": pytest.approx(5.0 * ARCSECOND)}
+    assert consider.time_offset == {"star": pytest.approx(6e-3)}
     assert consider.g_sensitivity == pytest.approx(7.0 * np.pi / 180.0 / 3600.0 / 9.80665, rel=1e-12)  # rad/s per m/s²
+    _, consider, options = reached("low-orbit", "magnetometer.bias=100", "initial.attitude=2", "initial.bias=30")
+    assert consider.sensor_bias == {"magnetometer": pytest.approx(100e-9)}
+    assert options["initial_attitude_sigma"] == pytest.approx(2.0 * DEGREE)
+    assert options["initial_bias_sigma"] == pytest.approx(30.0 * DEGREE / 3600.0)

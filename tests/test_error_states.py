@@ -13,7 +13,6 @@ from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, record_of, 
 from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
-from strapdown.checks import InputError
 from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.observability import state_names, without_errors
@@ -23,7 +22,7 @@ from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine, six_states, smoother, structure
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements, triad
+from strapdown.vectors import triad
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 
@@ -330,24 +329,6 @@ def rows_at(face, sensor, kind, reference, z, transverse):
 # -------------------------------------------------------------------------------------------------------------- sharp, diffuse, long
 
 
-@pytest.mark.parametrize(
-    ("prior", "sigma", "bound"),
-    [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)],
-    ids=["1 arcsecond", "anywhere, 0.2 arcseconds"],
-)
-def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
-    """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""
-    P = diffuse(prior, sigma)
-    expected = np.diag(1.0 / (np.array([1.0, 1.0, 2.0]) / sigma**2 + 1.0 / prior**2))
-    np.testing.assert_allclose(P[:3, :3], expected, rtol=bound, atol=bound * sigma**2)
-    np.testing.assert_allclose(P[3:, 3:], np.eye(12), rtol=1e-14, atol=1e-14)
-
-
-def test_what_needs_more_digits_than_a_covariance_has_is_refused():
-    with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
-        diffuse(1e3, 1e-6)
-
-
 def diffuse(prior, sigma):
     """Return the covariance after two directions at once, of a filter whose first attitude has the σ ``prior``."""
     series = tuple(
@@ -402,29 +383,6 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
     sigma = np.sqrt(np.diag(expected))
     assert np.array_equal(P[:, :n], P[:, :n].T)
     assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1.0, 1e3])
-def test_the_covariance_stays_positive_definite(sharpness):
-    """Ten thousand predictions and updates whose σ is so many times the prior's; one of 1e-9 is refused."""
-    rng = np.random.default_rng(3)
-    edges = np.arange(10001) / 100.0
-    sensors = []
-    for name, r in (("mag", FIELD / np.linalg.norm(FIELD)), ("force", UP / 9.81)):
-        z = seen(SWAY.attitude(edges[1:]), r)
-        sensors.append(series_of(name, "vector", edges[1:], z, r, 0.03 * sharpness))
-    increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
-    record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
-    options = {"every": 100, "full_covariance": True}
-    if sharpness < 1e-8:
-        with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
-            estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options)
-        return
-    P = estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options).whole_covariance
-    assert np.array_equal(P, np.swapaxes(P, 1, 2))
-    # Of a correlation matrix eigenvalues below 1e-16 are rounding.
-    assert np.linalg.eigvalsh(correlation(P, np.sqrt(np.einsum("kii->ki", P)))).min() > -1e-14
 
 
 @pytest.mark.parametrize("option", ["all", pytest.param("a foreign block", marks=pytest.mark.slow)])
@@ -596,25 +554,6 @@ def test_the_rows_that_are_kept_do_not_change_the_filter():
         assert np.array_equal(rare.error_states[block.name].values, whole.error_states[block.name].values[::8])
 
 
-@pytest.mark.slow
-def test_a_gap_of_many_correlation_times_does_no_harm():
-    """What a coloured noise was before the gap says nothing of what it is after it; the steps within are bounded."""
-    record = record_of()
-    time = np.where(np.arange(len(record.time)) > 100, record.time + 60.0, record.time)
-    later = tuple(
-        dataclasses.replace(s, time=np.where(s.time > 2.0, s.time + 60.0, s.time)).taken(np.abs(s.time - 2.01) > 0.011)
-        for s in record.vectors[:3]
-    )
-    record = ImuRecord(time=time, increments=record.increments, vectors=later)
-    blocks = (error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2),)
-    ahead = estimation.run(record, NOISE, start(), blocks)
-    both = estimation.smooth(record, NOISE, start(), blocks)
-    assert ahead.error_states["force disturbance"].sigma[101] == pytest.approx(0.1, rel=1e-6)
-    assert np.all(np.isfinite(both.variance))
-    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
-    assert [event.kind for event in ahead.events] == ["gap"]
-
-
 # ------------------------------------------------------------------------------------------------------------------- observability
 
 
@@ -737,56 +676,6 @@ def test_observability_takes_every_kind_of_measurement():
 # ----------------------------------------------------------------------------------------------------------------------- bad input
 
 
-@dataclasses.dataclass(frozen=True)
-class Wrong(error_states.ErrorStates):
-    name: str = "wrong"
-    components: tuple[str, ...] = ("a",)
-    units: tuple[str, ...] = ("1",)
-    sigma: float = 1.0
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: error_states.GyroScale(scale_sigma=0.0, misalignment_sigma=0.1), "scale_sigma is 0"),
-        (lambda: error_states.VectorBias(sensor="mag", bias_sigma=[1.0, -1.0, 1.0]), r"bias_sigma\[1\] is -1"),
-        (lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=-1.0), "correlation_time is -1 s"),
-        (
-            lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=1.0, frame="bodi"),
-            "did you mean 'body'",
-        ),
-        (lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
-        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "are named 'mag bias'"),
-        (lambda: estimation.run(record_of(), NOISE, start(), ("mag",)), "declares no error states"),
-        (
-            lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorScale(sensor="tracker", scale_sigma=0.1),)),
-            "whole attitudes",
-        ),
-        (
-            lambda: estimation.run(
-                record_of(), NOISE, estimation.with_error_states(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
-            ),
-            "initial has 3 error states, but 9 are declared",
-        ),
-        (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
-        (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),
-        (
-            lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=[1.0, 2.0, 1.0], correlation_time=1.0, frame="fixed"),
-            "differs by axis",
-        ),
-        (lambda: estimation.run(record_of(), NOISE, start(), every=0), "every is 0"),
-        (lambda: estimation.observability(record_of(), NOISE, start(), threshold=0.0), "threshold is 0"),
-        (
-            lambda: estimation.run(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"]).errors(np.zeros(4), np.zeros(3)),
-            "true_values has",
-        ),
-    ],
-)  # fmt: skip
-def test_bad_input_is_refused_with_the_remedy(make, words):
-    with pytest.raises(InputError, match=words):
-        make()
-
-
 def _laid_out_otherwise(record):
     """Return the same record with times that may be written to and come with gaps, and one σ for all measurements of a sensor."""
     series = (dataclasses.replace(one, sigma=float(one.sigma[0])) for one in record.vectors)
@@ -812,22 +701,3 @@ def test_the_kernels_are_compiled_once_for_a_structure():
         estimation.smooth(_laid_out_otherwise(record), NOISE, start(), others)
         assert [dispatcher.signatures for dispatcher in dispatchers] == compiled
         assert all(compiled)
-
-
-@pytest.mark.parametrize("option", ["none", pytest.param("gyro scale", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
-def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
-    """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
-    turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
-    seen = VectorMeasurements(
-        sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
-    )
-    record = resting(seen)
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
-    found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
-    correction = wide**2 / (wide**2 + sigma**2) * turn
-    assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
-    assert abs(np.linalg.norm(found.attitude[0]) - 1.0) < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
-    J = kinematics.right_jacobian(correction)
-    P = J @ J.T / (wide**-2.0 + sigma**-2.0)
-    np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

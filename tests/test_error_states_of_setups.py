@@ -2,15 +2,13 @@
 
 import dataclasses
 
-import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
 from measured import FIELD, drawn_start, resting, seen, series_of, turn_to, unit
 from measured import HAND as SWAY
 
-from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, vectors
-from strapdown.checks import InputError
+from strapdown import estimation, kinematics, motion, quaternion, scenarios, vectors
 from strapdown.estimation import angular_acceleration, error_states, forward, setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.model import assemble
@@ -20,8 +18,7 @@ from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import structure
-from strapdown.randomness import generator
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
@@ -95,58 +92,6 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
     ) == setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"gyro_scale_sigma_pmm": 1.0}, "did you mean 'gyro_scale_sigma_ppm'"),
-        ({"gyro_scale_sigma_ppm": [1.0, 2.0]}, r"gyro_scale_sigma has shape \(2,\)"),
-        ({"gyro_scale_sigma_ppm": -5.0}, "must not be negative"),
-        ({"gyro_misalignment_sigma_mrad": [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "entries on its diagonal"),
-        ({"gyro_drift_sigma_deg_per_hour": [1.0]}, "1 entries and gyro_drift_time 0"),
-        ({"gyro_drift_sigma_deg_per_hour": [1.0], "gyro_drift_time_s": [0.0]}, r"gyro_drift_time\[0\] is 0 s"),
-        ({"gyro_force_sigma_deg_per_hour_per_g": 1.0, "gravity_f_m_per_s2": [0, 0, 0]}, "free fall"),
-        ({"sensors": 3}, "must be a table of tables"),
-        ({"sensors": {"mag": 3}}, r"sensors: mag is 3; it must be a table"),
-        ({"sensors": {"mag": {"bias_sigm": 1.0}}}, "did you mean 'bias_sigma'"),
-        ({"sensors": {"mag": {"bias_sigma": [1.0, 0.0, 1.0]}}}, "give a value above zero for every axis"),
-        ({"sensors": {"mag": {"correlated_sigma": 1.0}}}, "give both above zero"),
-        (
-            {"sensors": {"mag": {"correlated_sigma": 1.0, "correlation_time_s": 1.0, "frame": "bodi"}}},
-            "did you mean 'body'",
-        ),
-        ({"sensors": {"mag": {"varying": 1}}}, "varying is 1; it must be true or false"),
-    ],
-)
-def test_bad_tables_are_refused_with_their_place(table, words):
-    with pytest.raises(InputError, match=words) as caught:
-        optional.from_table(table, "f.toml: filter: states")
-    assert "f.toml: filter: states" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "states is {}, not of class States"),
-        (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
-        (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
-        (lambda: WHOLE.select(("gyro.scael",)), "did you mean 'gyro.scale'"),
-        (lambda: States().select(("gyro.scale",)), "no states are declared"),
-        (lambda: run(uneven(), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "equal gyro intervals"),
-        (lambda: run(simulated(duration=1.0), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "needs 100"),
-        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
-        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=[0.1, -1.0, 0.0]), r"arm_sigma\[1\] is -1 m"),
-        (lambda: error_states.GyroForce(along_sigma=0.0), "along_sigma is 0"),
-        (
-            lambda: error_states.GyroScale(scale_sigma=np.zeros(3), misalignment_sigma=np.zeros((3, 3))),
-            "scale_sigma and misalignment_sigma are both 0",
-        ),
-    ],
-)  # fmt: skip
-def test_bad_input_is_refused_with_the_remedy(make, words):
-    with pytest.raises(InputError, match=words):
-        make()
-
-
 def chosen(states, **more) -> FilterSetup:
     return FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=3e-3, states=states, **more)
 
@@ -155,48 +100,7 @@ def run(record, filter_setup, **options):
     return setup.run(record, filter_setup, begun(record), **options)
 
 
-def uneven() -> ImuRecord:
-    record = simulated()
-    kept = np.r_[0:500, 501 : len(record.time)]
-    increments = np.add.reduceat(record.increments, kept[:-1], axis=0)
-    truth = Truth(attitude=record.truth.attitude[kept], bias=record.truth.bias[kept])
-    return ImuRecord(time=record.time[kept], increments=increments, vectors=record.vectors, truth=truth)
-
-
 # ---------------------------------------------------------------------------------------------- without states: the plain filter
-
-
-def test_without_states_it_is_the_plain_filter_gates_and_all():
-    record = missing(simulated(kind="direction", outlier_probability=0.1))
-    options = {"gate": Gate(recovery=None), "robust": Robust()}
-    initial = begun(record)
-    one = estimation.run(record, NOISE, initial, every=7, full_covariance=True, **options)
-    other = setup.run(record, chosen(States()), initial, every=7, full_covariance=True, **options)
-    np.testing.assert_allclose(other.attitude, one.attitude, atol=1e-12)
-    np.testing.assert_allclose(other.bias, one.bias, atol=1e-13)
-    np.testing.assert_allclose(other.variance, one.variance, rtol=1e-10)
-    np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-8, atol=1e-10 * np.max(one.covariance))
-    assert [(event.kind, event.start, event.end) for event in other.events] == [
-        (event.kind, event.start, event.end) for event in one.events
-    ]
-    assert [(event.sensor, event.value) for event in other.events] == [
-        (event.sensor, pytest.approx(event.value)) for event in one.events
-    ]
-    assert other.skipped == one.skipped == {"mag": 7, "acc": 0}
-    assert other.refused == one.refused
-    assert sum(one.refused.values()) > 10
-    for sensor, innovations in one.innovations.items():
-        found = other.innovations[sensor]
-        np.testing.assert_allclose(found.innovation, innovations.innovation, atol=1e-10)
-        np.testing.assert_allclose(found.variance, innovations.variance, rtol=1e-9)
-        np.testing.assert_allclose(found.weight, innovations.weight, atol=1e-9)
-
-
-def missing(record):
-    first, *rest = record.vectors
-    vector = first.vector_b.copy()
-    vector[20:27] = np.nan
-    return dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
 
 
 def test_a_gate_keeps_outliers_from_the_states():
@@ -322,59 +226,6 @@ def test_force_s_transition_is_the_derivative():
         ahead, back = (moved(values + sign * 1e-5 * np.eye(9)[k]) for sign in (1.0, -1.0))
         numeric = turn_to(back.attitude, ahead.attitude) / 2e-5
         np.testing.assert_allclose(face.F[:3, 6 + k], numeric, rtol=0, atol=1e-5 * np.max(np.abs(numeric)) + 1e-9)
-
-
-@pytest.mark.slow
-def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
-    record = simulated(duration=3.0)
-    scale = error_states.GyroScale(scale_sigma=np.array([0.0, 0.0, 0.01]), misalignment_sigma=np.zeros((3, 3)))
-    force = error_states.GyroForce(along_sigma=np.array([1e-3, 0.0, 2e-3]))
-    blocks = (scale, force, error_states.VectorBias(sensor="mag", bias_sigma=3e-6))
-    assert [block.components for block in blocks[:2]] == [("z",), ("x", "z")]
-    one = estimation.run(record, NOISE, begun(record), blocks, full_covariance=True)
-    other = in_steps.run(record, NOISE, begun(record), blocks)
-    np.testing.assert_allclose(one.attitude, other.attitude, atol=1e-11)
-    assert in_steps.apart(one, other) < 1e-8
-    smoothed = estimation.smooth(record, NOISE, begun(record), blocks, full_covariance=True)
-    np.testing.assert_allclose(smoothed.whole_covariance[-1], one.whole_covariance[-1], rtol=1e-8, atol=1e-16)
-
-
-# ------------------------------------------------------------------------------------------------------------- the step face
-
-IRON = error_states.VectorBias(sensor="mag", bias_sigma=3e-6, rate_random_walk=3e-8, unit="T")
-HELD = error_states.BoundedVelocity(
-    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, strength=1.0
-)
-
-
-def test_the_step_face_goes_on_from_a_part_as_the_record_does():
-    """The gate's whole memory goes along, and what a candidate's blocks know: one walks, one forgets in chains."""
-    record, blocks, gate = simulated(duration=4.0), (IRON, HELD), Gate(recovery=30)
-    record = dataclasses.replace(record, time=record.time + 100.0)
-    record = dataclasses.replace(
-        record, vectors=tuple(dataclasses.replace(series, time=series.time + 100.0) for series in record.vectors)
-    )
-    initial = begun(record)
-    turned = quaternion.multiply(initial.attitude, quaternion.exp([1.0, 0.5, -1.0]))
-    initial = dataclasses.replace(initial, attitude=turned)
-    challenged, reported = 0, 0
-    for cut in (7, 20, 33):
-        first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
-        _, middle = estimation.run_part(first, NOISE, initial, blocks, gate=gate)
-        second, end = estimation.run_part(rest, NOISE, middle, blocks, gate=gate)
-        challenged += int(middle.gate.counts[0])
-        step = in_steps.run(rest, NOISE, middle, blocks, gate=gate)
-        last = step.state
-        assert quaternion.angle_between(last.attitude, end.attitude) < 1e-10
-        sigma = np.sqrt(np.diag(end.covariance))
-        np.testing.assert_allclose(last.values / sigma[6:], end.values / sigma[6:], rtol=0.0, atol=1e-8)
-        assert np.abs((last.covariance - end.covariance) / np.outer(sigma, sigma)).max() < 1e-8
-        assert sorted(map(str, step.events)) == sorted(map(str, second.events))
-        reported += any(event.kind == "recovery" for event in step.events)
-    assert challenged >= 2
-    assert reported >= 2
-    with pytest.raises(InputError, match=r"time is 0 s, before the record of initial began, 100 s; give the time"):
-        GatedStepFilter(NOISE, middle, blocks, gate=gate)
 
 
 # ------------------------------------------------------------------------------------------------------------------- sensors
@@ -591,22 +442,6 @@ def test_chosen_states_are_those_named():
     assert WHOLE.names == (
         "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.mounting", "mag.bias", "acc.lever", "acc.correlated",
     )  # fmt: skip
-
-
-def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
-    from strapdown.estimation.setup import read_estimate, write_estimate
-
-    scenario = scenarios.load_scenario("low-orbit")
-    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-    record = scenarios.simulate(scenarios.drawn(dataclasses.replace(scenario, duration=1200.0), 2), 2)
-    draw = generator(2, 0, "start").standard_normal(6)
-    initial = drawn_start(record.truth, draw, filter_setup.attitude_sigma, filter_setup.bias_sigma)
-    estimate = setup.run(record, filter_setup, initial, full_covariance=True)
-    write_estimate(tmp_path / "e.h5", estimate)
-    again = read_estimate(tmp_path / "e.h5")
-    truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias)
-    assert "not consistent" not in consistency.judge(again, truth).verdict
-    assert np.array_equal(again.covariance, estimate.covariance)
 
 
 def test_the_acceleration_of_a_vibration_is_not_reported_too_small():

@@ -26,12 +26,11 @@ from measured import (
 from strapdown import consistency, estimation, montecarlo, quaternion, records
 from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
-from strapdown.estimation.model import assemble
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise, State, restart_bias_variance
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import gate, gate_rules, iterated_update, structure
+from strapdown.kernels import gate_rules
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
@@ -308,166 +307,6 @@ def test_a_right_filter_never_starts_anew(runs):
 # ---------------------------------------------------------------------------------------------------------- what a candidate knows
 
 
-@dataclasses.dataclass(frozen=True)
-class Still(error_states.ErrorStates):
-    """States that enter nothing."""
-
-    dynamics: np.ndarray
-    """λ and the density of the driving noise of each state (2, size)."""
-    name: str = "still"
-
-    @property
-    def components(self):
-        return tuple(f"c{k}" for k in range(self.dynamics.shape[1]))
-
-    @property
-    def units(self):
-        return ("1",) * self.size
-
-    @property
-    def sigma(self):
-        return np.ones(self.size)
-
-    @property
-    def decay(self):
-        return self.dynamics[0]
-
-    @property
-    def density(self):
-        return self.dynamics[1]
-
-
-def form_of(*blocks, **kinds):
-    """A filter of error states and its restart candidate, all zero, and the kernels of its structure."""
-    model = assemble(blocks, kinds)
-    kernels = forward.instance_of(model)
-    form = structure.Body(
-        model=forward.kernel_model(model, (0.0, 0.0)),
-        x=np.zeros((2, kernels.N + 1)),
-        P=np.zeros((2, kernels.N * kernels.W)),
-        coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
-        dt=np.zeros(1),
-        work=np.zeros(kernels.LINES * kernels.LINE),
-        shape=model.shape,
-        length=np.empty(0),
-        turning=np.empty((0, 9)),
-        offsets=model.offsets,
-    )
-    return form, kernels
-
-
-def covariance_in(form, i):
-    """Return a view of the covariance (n, n) of state i."""
-    n = form.x.shape[1] - 1
-    return form.P[i].reshape(n, -1)[:, :n]
-
-
-@pytest.mark.parametrize("level", [0, 2])
-def test_a_candidate_knows_what_the_prior_says_by_now(level):
-    """Means and covariance of states: one stays, one walks, one forgets, and two hang together; the others' σ is 3^level times as wide."""
-    memory, now, width = np.zeros(gate_rules.MEMORY), 7.1, 3.0**level
-    memory[gate_rules.LEVEL] = level
-    decay, density = np.array([0.0, 0.0, 0.3, 0.5]), np.array([0.0, 4e-4, 0.05, 0.0])
-    rng = np.random.default_rng(3)
-    root = np.tril(rng.standard_normal((4, 4)))
-    values, age = rng.standard_normal(4), 1.7
-    size, bias_sigma = 10, np.array([0.3, 0.1, 0.2])
-    form, kernels = form_of(Still(np.stack([decay, density])))
-    form.P[1], form.x[1], form.coefficients[:] = np.nan, np.nan, np.nan
-    form.x[0] = [*unit(rng.standard_normal(4)), *rng.standard_normal(7)]
-    own = np.tril(rng.standard_normal((size, size)))
-    covariance_in(form, 0)[:] = P = own.T @ own
-    restart = gate.Restart(bias_variance=bias_sigma**2, values=values, covariance=root.T @ root, time=now - age)
-    kernels.start_candidate(form, memory, now, 1.8, restart)
-    expected = np.zeros((size, size))
-    expected[:3, :3] = max(1.8, min(1.8 * width, UNIFORM_SIGMA)) ** 2 * np.eye(3)
-    expected[3:6, 3:6] = P[3:6, 3:6] + width**2 * np.diag(bias_sigma**2)
-    kept = np.exp(-decay * age)
-    time = np.where(decay > 0.0, (1.0 - kept**2) / np.where(decay > 0.0, 2.0 * decay, 1.0), age)
-    expected[6:, 6:] = kept[:, None] * (root.T @ root) * kept + np.diag(density * time)
-    np.testing.assert_allclose(covariance_in(form, 1), expected, rtol=1e-12, atol=1e-14)
-    assert np.array_equal(form.x[1, :7], form.x[0, :7])
-    np.testing.assert_allclose(form.x[1, 7:], kept * values, rtol=1e-14)
-    assert np.array_equal(covariance_in(form, 0), P)
-    assert (memory[gate_rules.CANDIDATE], memory[gate_rules.SINCE]) == (1.0, now)
-    assert np.array_equal(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_VARIANCE], form.x[0, 4:7])
-    np.testing.assert_allclose(memory[gate_rules.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
-
-
-@pytest.mark.parametrize("age", [0.0, 0.03, 1.7, 300.0])
-def test_a_candidate_knows_what_the_prior_of_chains_says_by_now(age):
-    """States that feed one another, two and three in a chain, from a prior that is not stationary: the block's own Φ and Q."""
-    blocks = (
-        error_states.BoundedVelocity(sensor="acc", velocity_time=2.0, velocity_sigma=0.3, acceleration_sigma=1.5),
-        error_states.BoundedVelocity(
-            sensor="acc", velocity_time=2.0, velocity_sigma=0.3, acceleration_sigma=1.5, position_time=9.0, name="other"
-        ),
-    )
-    m = sum(block.size for block in blocks)
-    rng = np.random.default_rng(8)
-    root, values = np.tril(rng.standard_normal((m, m))), rng.standard_normal(m)
-    form, kernels = form_of(*blocks, acc="direction")
-    covariance_in(form, 0)[:] = np.eye(6 + m)
-    restart = gate.Restart(bias_variance=np.ones(3), values=values, covariance=root.T @ root, time=0.0)
-    kernels.start_candidate(form, np.zeros(gate_rules.MEMORY), age, 1.8, restart)
-    Phi, Q = np.eye(m), np.zeros((m, m))
-    first = 0
-    for block in blocks:
-        own = slice(first, first + block.size)
-        if age > 0.0:
-            Phi[own, own], Q[own, own] = block.transition(age), block.process_noise(age)
-        first += block.size
-    np.testing.assert_allclose(form.x[1, 7:], Phi @ values, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(covariance_in(form, 1)[6:, 6:], Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
-
-
-def candidate_of(P, bias, values):
-    """A candidate with covariance P, the kernels, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
-    form, kernels = form_of(Still(np.zeros((2, len(values)))))
-    covariance_in(form, 1)[:] = P
-    form.x[:, 0], form.x[1, 4:] = 1.0, [*bias, *values]
-    memory = np.zeros(gate_rules.MEMORY)
-    memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6] = STARTED**2
-    return form, kernels, memory
-
-
-STARTED = np.array([0.1, 0.2, 0.3])
-
-
-def test_a_candidate_that_is_widened_is_what_it_would_be_had_it_started_so():
-    """Attitude, bias and three states after five measurements, by information: the start's own is taken out but for a ninth of it."""
-    rng = np.random.default_rng(4)
-    H = rng.standard_normal((5, 9)) / np.array([0.3, 0.3, 0.3, *STARTED, 1.0, 1.0, 1.0])
-    z = rng.standard_normal(5)
-    start = np.array([1.8, 1.8, 1.8, *STARTED, 1.0, 2.0, 0.5])
-    wide = start * np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 1.0, 1.0, 1.0])
-    P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
-    mean, there = P @ H.T @ z, expected @ H.T @ z
-    form, kernels, memory = candidate_of(P, mean[3:6], mean[6:])
-    kernels.widen(form, memory)
-    np.testing.assert_allclose(form.x[1, 4:], there[3:], rtol=1e-9, atol=1e-12)
-    turn = quaternion.exp(there[:3] - mean[:3])
-    np.testing.assert_allclose(form.x[1, :4], turn, atol=1e-12)
-    upper = tuple(expected[:3, :3][np.triu_indices(3)])
-    G = np.eye(9)
-    G[:3, :3] = np.reshape(iterated_update.tangent_at(tuple(turn), upper)[0], (3, 3))
-    np.testing.assert_allclose(covariance_in(form, 1), G @ expected @ G.T, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6], 9.0 * STARTED**2)
-    assert memory[gate_rules.LEVEL] == 1.0
-
-
-def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
-    """Of a filter's own bias, as uncertain as its start and correlated: more is known of the start than its diagonal says."""
-    P = np.eye(6)
-    P[3:, 3:] = np.outer(STARTED, STARTED) * (0.2 * np.eye(3) + 0.8)
-    form, kernels, memory = candidate_of(P, 0.5 * STARTED, ())
-    kernels.widen(form, memory)
-    found = covariance_in(form, 1)
-    assert np.isfinite(found).all()
-    assert np.min(np.linalg.eigvalsh(found - P)) > -1e-12
-    assert np.all(np.diag(found)[3:] > np.diag(P)[3:])
-
-
 def test_a_start_that_is_surer_than_its_blocks_is_not_accepted_by_a_candidate():
     """A start that goes on from an earlier part: its values are kept, and what it knows of them is what the block says at least."""
     one = made("hard iron", 2)
@@ -552,29 +391,6 @@ def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
     assert np.array_equal(state.values, end.values)
 
 
-@pytest.mark.parametrize("recovery", [10, None])
-@pytest.mark.parametrize(
-    "blocks", [(), pytest.param(CASES["biased heading"][1], marks=pytest.mark.slow)], ids=["plain", "states"]
-)
-def test_the_heading_of_a_vertical_vector_is_passed_over(blocks, recovery):
-    """Both faces skip it, and do not refuse it; without states it is the plain filter again."""
-    one = made("biased heading", 1, duration=2.0)
-    compass, star = one.record.vectors
-    value = compass.vector_b.copy()
-    value[0] = [0.0, 0.0, 1.0]
-    record = dataclasses.replace(one.record, vectors=(dataclasses.replace(compass, vector_b=value), star))
-    start = dataclasses.replace(one.initial, attitude=np.array([1.0, 0.0, 0.0, 0.0]))
-    gate = Gate(recovery=recovery)
-    whole = estimation.run(record, NOISE, start, blocks, gate=gate)
-    step = in_steps.run(record, NOISE, start, blocks, gate=gate)
-    assert whole.skipped == step.skipped == {"compass": 1, "star": 0}
-    assert whole.refused == step.refused
-    assert len(whole.innovations["compass"].time) == len(compass.time) - 1
-    assert np.isfinite(whole.attitude).all()
-    if not blocks:
-        assert estimation.run(record, NOISE, start, gate=gate).refused == whole.refused
-
-
 WALKING = error_states.VectorBias(sensor="mag", bias_sigma=1e-6, rate_random_walk=1e-8, unit="T")
 
 
@@ -624,20 +440,6 @@ def test_both_faces_widen_a_candidate_alike(case):
     assert in_steps.apart(whole, step) < 1e-8
 
 
-def test_the_step_face_says_what_it_took():
-    one = made("hard iron", 0, duration=1.0)
-    face = GatedStepFilter(NOISE, one.initial, (IRON,), gate=Gate())
-    mag = one.record.vectors[0]
-    assert face.update(mag)
-    assert (face.weight, face.refused) == (1.0, {})
-    kept = face.attitude.copy(), face.P.copy(), face.values.copy()
-    assert not face.update(dataclasses.replace(mag, vector_b=-mag.vector_b))
-    assert (face.weight, face.refused) == (0.0, {"mag": 1})
-    assert face.nis > 1e3
-    for now, before in zip((face.attitude, face.P, face.values), kept, strict=True):
-        assert np.array_equal(now, before)
-
-
 # ------------------------------------------------------------------------------------------------------------------------- setups
 
 
@@ -661,18 +463,6 @@ def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_
     assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
     iron = estimate.error_states["mag bias"]
     assert np.all(np.abs(iron.values[-1] - one.truth[IRON.name]) < 4.5 * iron.sigma[-1])
-
-
-@pytest.mark.slow
-def test_a_lever_arm_recovers():
-    one = made("hard iron", 5, duration=6.0)
-    states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})
-    filter_setup = FilterSetup(process_noise=NOISE, bias_sigma=BIAS_SIGMA, states=states, gate=Gate())
-    estimate = setup.run(one.record, filter_setup, lost(one.initial, 5), full_covariance=True)
-    assert len(recoveries(estimate)) == 1
-    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
-    arm = estimate.error_states["acc lever arm"]
-    assert np.all(np.abs(arm.values[-1]) < 4.5 * arm.sigma[-1])
 
 
 def test_a_campaign_of_lost_starts_with_states_ends_consistent():

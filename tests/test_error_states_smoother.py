@@ -371,26 +371,6 @@ def difference(one, other, k=slice(None), j=slice(None)):
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
 
-def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
-    """A still gyro with a large bias: steps are cut by the turn without the bias, and are more than the increments suggest."""
-    rng = np.random.default_rng(5)
-    time = np.arange(21.0)
-    z = np.tile([0.0, 0.0, 1.0], (20, 1)) + 0.02 * rng.standard_normal((20, 3))
-    up = [0.0, 0.0, 1.0]
-    series = series_of("mag", "vector", time[1:], z, up, 0.02)
-    silent = series_of("acc", "vector", [1.0], [[np.nan, np.nan, np.nan]], UP, 0.05)  # as other tests: one structure
-    start = estimation.State(
-        attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, 3.0]), covariance=np.diag([1e-4] * 3 + [1e-12] * 3)
-    )
-    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
-    found = []
-    for parts in (1, 10):
-        edges = np.arange(20 * parts + 1) / parts
-        record = ImuRecord(time=edges, increments=np.zeros((20 * parts, 3)), vectors=(series, silent))
-        found.append(estimation.smooth(record, noise, start, (IRON,), full_covariance=True))
-    assert difference(found[0], found[1], slice(None), slice(None, None, 10)) < 1e-6
-
-
 # --------------------------------------------------------------------------------------------------------------------- recoveries
 
 

@@ -19,16 +19,14 @@ from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, setup
 from strapdown.estimation.error_states import stationary_covariance
-from strapdown.estimation.model import assemble
-from strapdown.estimation.setup.states import SensorStates, States, from_table
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
-from strapdown.vectors import Accelerometer, VectorMeasurements
+from strapdown.vectors import Accelerometer
 
 NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=1e-4)
 HAND = waves(((1.1, 0.3, -0.4), 0.21), ((-0.4, 0.9, 0.8), 0.37, 0.4))
@@ -229,54 +227,6 @@ def test_names_units_and_strength():
     assert three.units == ("m", "m/s", "m/s²") * 3
 
 
-# ------------------------------------------------------------------------------------------------------------------ bad input
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"velocity_time": 0.0, "velocity_sigma": 1.0, "acceleration_time": 1.0}, "velocity_time is 0 s"),
-        ({"velocity_time": 1.0}, "two must be above zero"),
-        ({"velocity_time": 1.0, "velocity_sigma": 1.0}, "two must be above zero"),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 3.0, "acceleration_time": 1.0},
-            "contradict each other",
-        ),
-        ({"velocity_time": 1.0, "velocity_sigma": -1.0, "acceleration_time": 1.0}, "velocity_sigma is -1"),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "position_time": np.nan},
-            "position_time is nan",
-        ),
-        (
-            {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 1.0, "position_time": 0.5},
-            "less than velocity_time and position_time imply",
-        ),
-        ({"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "strength": 0.0}, "strength is 0"),
-    ],
-)
-def test_impossible_blocks_are_refused(fields, words):
-    with pytest.raises(InputError, match=words):
-        error_states.BoundedVelocity(sensor="acc", **fields)
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"feed": [1.0, 1.0]}, "no state follows it"),
-        ({"feed": [1.0, 1.0, 1.0, 0.0]}, "a chain has at most 3"),
-        ({"feed": [1.0, 0.0], "gyro_offset": np.eye(3)[:2]}, "belongs to a chain and enters the gyro"),
-        ({"feed": [1.0, 0.0, 0.0]}, "feed"),
-    ],
-)
-def test_impossible_chains_are_refused(fields, words):
-    n = 2 if len(fields["feed"]) == 3 else len(fields["feed"])
-    given = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
-    names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    block = type("Foreign", (error_states.ErrorStates,), {**given, **names})()
-    with pytest.raises(InputError, match=words):
-        assemble((block,), {"acc": "vector"})
-
-
 # ------------------------------------------------------------------------------------------------------------------ both faces
 
 
@@ -373,13 +323,6 @@ def test_both_faces_agree(option, kind):
         np.testing.assert_allclose(slow.whitened[name], one.whitened, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("option", BLOCKS)
-def test_no_time_changes_nothing(option):
-    for block in BLOCKS[option]:
-        assert np.array_equal(block.transition(0.0), np.eye(block.size))
-        assert np.array_equal(block.process_noise(0.0), np.zeros((block.size, block.size)))
-
-
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
 
 
@@ -444,17 +387,6 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     sigma = np.sqrt(variance)
     assert np.max(np.abs(values - wanted) / sigma) < 1e-3 * np.max(np.abs(wanted) / sigma)
     np.testing.assert_allclose(np.einsum("kii->ki", found.whole_covariance), variance, rtol=1e-4)
-
-
-def test_the_observability_report_knows_its_states():
-    block = block_of("velocity")
-    record, _ = record_of(block)
-    found = estimation.observability(record, NOISE, start(), (block,))
-    assert found.states[6:8] == ("acc velocity velocity x", "acc velocity drive x")
-    # What pushes is felt at once; of the velocity there is what it has been pushed to.
-    assert np.all(found.start_sigma[7::2] < 0.9 * found.prior_sigma[7::2])
-    assert np.all(found.singular_values >= 0.0)
-    assert "velocity x" in str(found)
 
 
 def test_a_gap_of_many_correlation_times_forgets_the_velocity():
@@ -577,41 +509,6 @@ def test_consistency_over_many_runs(poles, smoothed):
         assert_inside(found[part][:, -1].mean(), degrees, 400, 0.999)
 
 
-@pytest.mark.parametrize("passes", [1, WIDE_PASSES], ids=["once", "iterated"])
-def test_a_correction_turns_what_is_carried(passes):
-    """By an attitude of which the states know nothing, so that only the turn changes them: as the body sees them they stay the same."""
-    blocks = (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block_of("position"))
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=3e-3)
-    state = estimation.with_error_states(initial, blocks)
-    rng = np.random.default_rng(5)
-    P = state.covariance.copy()
-    root = np.eye(9) + 0.3 * rng.standard_normal((9, 9))
-    P[15:, 15:] = root @ P[15:, 15:] @ root.T
-    state = dataclasses.replace(state, covariance=P, values=rng.standard_normal(18))
-    face = StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
-    face._passes = passes
-    turn = quaternion.exp([0.5, -0.7, 0.4])
-    star = VectorMeasurements(sensor="star", kind="attitude", time=[0.0], attitude=[turn], sigma=1e-6)
-    assert face.update(star)
-    np.testing.assert_allclose(quaternion.angle_between(face.attitude, turn), 0.0, atol=1e-9)
-    R = quaternion.to_matrix(face.attitude)
-    T = np.kron(R, np.eye(3))  # the states stand axis by axis
-    np.testing.assert_allclose(face.values[9:], T @ state.values[9:], rtol=1e-12)
-    np.testing.assert_allclose(face.P[15:, 15:], T @ P[15:, 15:] @ T.T, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(face.values[:9], state.values[:9], rtol=1e-12)
-
-
-def test_what_is_carried_must_be_alike_on_three_axes():
-    class Lopsided(error_states.BoundedVelocity):
-        @property
-        def decay(self):
-            return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
-
-    block = Lopsided(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
-    with pytest.raises(InputError, match="axes x, y and z, in this order"):
-        assemble((block,), {"acc": "vector"})
-
-
 # ------------------------------------------------------------------------------------------------------------------ setups and files
 
 TOLD = SensorStates(velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
@@ -648,20 +545,6 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
     assert whole.velocity_sigma == 0.5
     with pytest.raises(InputError, match=r"acc: velocity_time needs an accelerometer; kind 'heading'"):
         states.blocks({"acc": "heading"})
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"velocity_time_s": 0.3}, "states: sensors: acc: .*two must be above zero"),
-        ({"velocity_sigma_m_per_s": 0.3}, "states: sensors: acc: .*velocity_time is 0 s"),
-        ({"velocity_time_s": -0.3}, "velocity_time is -0.3 s"),
-        ({"velocity_sigma_m_s": 0.3}, "did you mean 'velocity_sigma_m_per_s'"),
-    ],
-)
-def test_bad_tables_are_refused(table, words):
-    with pytest.raises(InputError, match=words):
-        from_table({"sensors": {"acc": table}})
 
 
 def test_a_setup_runs_it():

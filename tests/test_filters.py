@@ -3,7 +3,6 @@
 import dataclasses
 from functools import cache
 
-import mpmath
 import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
@@ -15,12 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from sims import filter_family as comparison
 from strapdown import consistency, estimation, kinematics, motion, quaternion
-from strapdown.checks import InputError
 from strapdown.consistency import Verdict
 from strapdown.estimation import filters
 from strapdown.estimation.filters import complementary
 from strapdown.kernels import complementary as complementary_kernel
-from strapdown.kernels import measurement, rotation
+from strapdown.kernels import measurement
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements, triad
@@ -206,27 +204,6 @@ def test_own_filters_tend_to_the_mekf_for_small_errors(name):
 
 
 @pytest.mark.parametrize("name", filters.FILTERS)
-def test_an_edge_more_at_each_measurement_changes_nothing(name):
-    """The interval is split at a measurement anyway; where the record has the cut, the filter must arrive at the same state."""
-    rng = np.random.default_rng(12)
-    record = simulated(rng, intervals=30, measurements=6)
-    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    times = np.unique(np.concatenate([record.time, *[s.time for s in record.vectors]]))
-    interval = np.searchsorted(record.time, times[1:], side="left") - 1
-    split = ImuRecord(
-        time=times,
-        increments=record.increments[interval] * (np.diff(times) / np.diff(record.time)[interval])[:, None],
-        vectors=record.vectors,
-    )
-    whole = filters.run(name, record, BELIEF, initial, full_covariance=True)
-    parts = filters.run(name, split, BELIEF, initial, full_covariance=True)
-    kept = np.isin(times, record.time)
-    np.testing.assert_allclose(parts.attitude[kept], whole.attitude, atol=1e-12)
-    np.testing.assert_allclose(parts.bias[kept], whole.bias, atol=1e-12)
-    np.testing.assert_allclose(parts.covariance[kept], whole.covariance, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_and_variance_give_the_same_as_the_whole(name):
     rng = np.random.default_rng(13)
     record = simulated(rng, intervals=31, measurements=6)
@@ -240,23 +217,6 @@ def test_every_and_variance_give_the_same_as_the_whole(name):
     np.testing.assert_array_equal(whole.variance, np.diagonal(whole.covariance, axis1=1, axis2=2))
     for kind, dof in (("direction", 2), ("vector", 3), ("heading", 1)):
         assert whole.innovations[kind].whitened.shape == (6, dof)
-
-
-def test_steps_hold_the_whole_record_once():
-    rng = np.random.default_rng(14)
-    record = simulated(rng, intervals=40, kinds=("direction", "attitude"), measurements=30)
-    at_edge = dataclasses.replace(record.vectors[0], time=np.sort([*record.vectors[0].time[2:], *record.time[[0, 7]]]))
-    record = dataclasses.replace(record, vectors=(at_edge, record.vectors[1]))
-    taken = list(comparison.steps(record))
-    clock = record.time[0] + np.cumsum([one.dt for one in taken])
-    edges = np.array([one.measured is None for one in taken])
-    np.testing.assert_allclose(clock[edges], record.time, rtol=1e-12)
-    total = np.cumsum([one.increment for one in taken], axis=0)[edges]
-    np.testing.assert_allclose(total[1:], np.cumsum(record.increments, axis=0), atol=1e-13)
-    for series in record.vectors:
-        mine = [k for k, one in enumerate(taken) if one.measured is not None and one.measured[0] is series]
-        assert [taken[k].measured[1] for k in mine] == list(range(30))
-        np.testing.assert_allclose(clock[mine], series.time, rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------- every kind of measurement and noise
@@ -715,34 +675,6 @@ def test_converges_from_large_errors(name, degrees, left):
 # ------------------------------------------------------------------------------------------------------------- wild starts
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.33333, 0.33334, 1.0, np.pi, 2.0 * np.pi, 50.0, 1e4])
-def test_coefficients_of_a_turn_of_any_size(angle):
-    """Against the series and closed forms in forty digits; either side of where polynomials give way to closed forms."""
-    with mpmath.workdps(60):
-        t = mpmath.mpf(angle) ** 2
-        t = mpmath.sqrt(mpmath.mpf(float(t)))  # of the squared angle as a double
-
-        def alternating(first):
-            return mpmath.nsum(lambda k: (-1) ** k * t ** (2 * k) / mpmath.factorial(2 * k + first), [0, mpmath.inf])
-
-        if angle <= 1.0:
-            wanted = [alternating(1), alternating(2), alternating(3), alternating(4), 2 * alternating(5)]
-        else:
-            third = (t - mpmath.sin(t)) / t**3
-            wanted = [mpmath.sin(t) / t, (1 - mpmath.cos(t)) / t**2, third, (t**2 / 2 - 1 + mpmath.cos(t)) / t**4]
-            wanted.append((mpmath.mpf(1) / 3 - 2 * third) / t**2)
-        wanted = [float(one) for one in wanted]
-    phi = angle * np.array([0.6, -0.64, 0.48])
-    q, J = rotation.moved((1.0, 0.0, 0.0, 0.0), tuple(phi))
-    skew = kinematics.skew(np.array([0.6, -0.64, 0.48]))
-    expected = np.eye(3) - wanted[1] * angle * skew + wanted[2] * angle**2 * skew @ skew
-    np.testing.assert_allclose(np.reshape(J, (3, 3)), expected, rtol=0.0, atol=2e-12)
-    # The norm of the rotation vector is that of its rounded components; an angle of 1e4 is known to 1e-12.
-    half = 0.5 * np.linalg.norm(phi)
-    direction = np.sinc(half / np.pi) * 0.5 * phi
-    np.testing.assert_allclose(q, [np.cos(half), *direction], rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("angle", [1e-6, 0.2, 0.5, 2.0, np.pi, 9.0])
 def test_propagation_over_any_turn_is_that_of_its_linear_system(angle, name):
@@ -865,58 +797,6 @@ def test_a_heading_seen_straight_up_says_nothing(name):
         assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
 
 
-# --------------------------------------------------------------------------------------------------------------- bad input
-
-
-def test_bad_input_is_refused():
-    rng = np.random.default_rng(20)
-    record = simulated(rng, intervals=10, measurements=3)
-    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    with pytest.raises(InputError, match="did you mean 'mahony'"):
-        filters.run("mahoni", record, BELIEF, initial)
-    given = {"kind": "direction", "time": [0.1], "vector_b": [[1.0, 0.0, 0.0]], "reference_f": [1.0, 0.0, 0.0]}
-    wrong = [
-        (VectorMeasurements(sensor="sun", sigma=0.0, **given), r"^sun: sigma\[0\] is 0 rad; a filter needs"),
-        (VectorMeasurements(sensor="sun", sigma_axes=[0.0, 1.0, 1.0], **given), r"^sun: sigma_axes\[0\] has a 0"),
-        (
-            VectorMeasurements(sensor="sun", covariance=np.diag([0.0, 1.0, 1.0]), **given),
-            r"^sun: covariance\[0\] is singular",
-        ),
-    ]
-    for name in filters.FILTERS:
-        for arguments, message in (
-            ((record, BELIEF, initial, 0), "^every is 0; it must be a whole number"),
-            ((record, BELIEF, initial, 1.5), "^every is 1.5"),
-            (("record.h5", BELIEF, initial, 1), "^record is 'record.h5', not of class ImuRecord; make it with"),
-            ((None, BELIEF, initial, 1), "^record is None, not"),
-            ((record, 1e-4, initial, 1), "^process_noise is 0.0001, not of class ProcessNoise; give"),
-            ((record, BELIEF, [1.0, 0.0, 0.0, 0.0], 1), "^initial is .*not of class State; make it with"),
-            ((record, initial, BELIEF, 1), "^process_noise is State"),
-            *(((dataclasses.replace(record, vectors=(s,)), BELIEF, initial, 1), said) for s, said in wrong),
-        ):
-            *first, every = arguments
-            with pytest.raises(InputError, match=message):
-                filters.run(name, *first, every=every)
-            if first[0] is record and every == 1 and name != "mekf":  # by the filter itself too
-                with pytest.raises(InputError, match=message):
-                    filters.FILTERS[name](*first)
-    for gains in (5, np.zeros((2, 2))):
-        with pytest.raises(InputError, match=r"^gains has shape"):
-            complementary.run(record, BELIEF, initial, gains=gains)
-
-
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_a_reference_for_each_measurement_is_taken_as_it_is(name):
-    rng = np.random.default_rng(22)
-    record = simulated(rng, intervals=20, measurements=5)
-    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    each = tuple(dataclasses.replace(series, reference_f=series.references_f.copy()) for series in record.vectors)
-    one = filters.run(name, record, BELIEF, initial)
-    other = filters.run(name, dataclasses.replace(record, vectors=each), BELIEF, initial)
-    assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
-    assert np.allclose(one.bias, other.bias, rtol=0.0, atol=1e-12)
-
-
 def test_comparing_all_is_one_line_with_a_table():
     rng = np.random.default_rng(47)
     record = simulated(rng, intervals=40, kinds=("direction", "attitude"), measurements=20)
@@ -946,9 +826,6 @@ def test_comparing_all_is_one_line_with_a_table():
     silent = filters.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")
     assert np.isnan(silent.summary()["mekf"]["nis"])
     assert "consistent filter" not in str(silent)
-    for names, message in (((), "^filters is empty; name at least one of mekf, mahony"), (["mefk"], "mean 'mekf'")):
-        with pytest.raises(InputError, match=message):
-            filters.compare(record, BELIEF, initial, filters=names)
 
 
 def test_findings_are_those_of_the_numbers():

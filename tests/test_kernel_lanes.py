@@ -15,7 +15,6 @@ from numba.core.errors import TypingError
 
 from strapdown.kernels import lane_values
 from strapdown.kernels.algebra import square_root
-from strapdown.kernels.filter_step import predict, update_direction
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
     WIDTH,
@@ -39,7 +38,6 @@ from strapdown.kernels.lane_values import (
     store_quadruples,
     sum_lanes,
 )
-from strapdown.kernels.rotation import rotation_matrix
 
 RANDOM = np.random.default_rng(5)
 
@@ -320,125 +318,6 @@ def test_inverse_roots_over_lanes():
         x = 10.0 ** RANDOM.uniform(-29.0, 29.0, WIDTH)
         fast(x, out)
         np.testing.assert_allclose(out, 1.0 / np.sqrt(x), rtol=5e-16)
-
-
-# ---------------------------------------------------------------------------------------------------- kernels over lanes
-
-
-STATE = 4 + 3 + 6 + 9 + 6
-
-
-def states():
-    """Eight attitudes, biases and covariances as 28 rows of lanes."""
-    rows = np.empty((WIDTH, STATE))
-    upper = np.triu_indices(3)
-    for i in range(WIDTH):
-        q = np.r_[1.0, 0.3 * RANDOM.standard_normal(3)]
-        factor = RANDOM.standard_normal((6, 6)) * 10.0 ** RANDOM.uniform(-3, -1, 6)[:, None]
-        P = factor @ factor.T
-        rows[i] = np.r_[
-            q / np.linalg.norm(q),
-            1e-3 * RANDOM.standard_normal(3),
-            P[:3, :3][upper],
-            P[:3, 3:].ravel(),
-            P[3:, 3:][upper],
-        ]
-    return rows.T.copy()
-
-
-def run_of(rows, like):
-    """Return (q, b, A, B, C) of so many runs, from 28 rows of them."""
-    x = tuple(load_like(rows, i * len(like), like) for i in range(28))
-    return x[:4], x[4:7], x[7:13], x[13:22], x[22:]
-
-
-run_of.__module__ = "strapdown.kernels.probe"  # so that kernels of this file may call it
-
-
-def stepped(pattern, rows, inputs, variance, out):
-    """Predict and update so many runs once; ``inputs`` are 6 rows: increments and measured directions of the z axis."""
-    like = lanes_of(pattern)
-    n = len(like)
-    q, b, A, B, C = run_of(rows, like)
-    turn = (load_like(inputs, 0, like), load_like(inputs, n, like), load_like(inputs, 2 * n, like))
-    q, A, B, C = predict(q, b, A, B, C, turn, 0.01, 1e-8, 1e-12)
-    z = (load_like(inputs, 3 * n, like), load_like(inputs, 4 * n, like), load_like(inputs, 5 * n, like))
-    q, b, A, B, C, e1, s1, e2, s2 = update_direction(
-        q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), z, variance
-    )
-    for i in range(4):
-        store(out, i * n, q[i])
-    for i in range(3):
-        store(out, (4 + i) * n, b[i])
-    for i in range(6):
-        store(out, (7 + i) * n, A[i])
-        store(out, (22 + i) * n, C[i])
-    for i in range(9):
-        store(out, (13 + i) * n, B[i])
-    store(out, 28 * n, e1)
-    store(out, 29 * n, s1)
-    store(out, 30 * n, e2)
-    store(out, 31 * n, s2)
-
-
-def stepped_scalars(rows, inputs, variance, out):
-    """Do the same for one run of plain floats."""
-    A = (rows[7], rows[8], rows[9], rows[10], rows[11], rows[12])
-    B = (rows[13], rows[14], rows[15], rows[16], rows[17], rows[18], rows[19], rows[20], rows[21])
-    C = (rows[22], rows[23], rows[24], rows[25], rows[26], rows[27])
-    b = (rows[4], rows[5], rows[6])
-    q = (rows[0], rows[1], rows[2], rows[3])
-    q, A, B, C = predict(q, b, A, B, C, (inputs[0], inputs[1], inputs[2]), 0.01, 1e-8, 1e-12)
-    q, b, A, B, C, e1, s1, e2, s2 = update_direction(
-        q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (inputs[3], inputs[4], inputs[5]), variance
-    )
-    for i in range(4):
-        out[i] = q[i]
-    for i in range(3):
-        out[4 + i] = b[i]
-    for i in range(6):
-        out[7 + i] = A[i]
-        out[22 + i] = C[i]
-    for i in range(9):
-        out[13 + i] = B[i]
-    out[28], out[29], out[30], out[31] = e1, s1, e2, s2
-
-
-def in_lanes(step, rows, inputs, variance, width):
-    """Return the step of all runs (runs, 32), ``width`` at a time."""
-    parts = []
-    for first in range(0, len(rows), width):
-        group = slice(first, first + width)
-        out = np.empty((32, width))
-        step((0.0,) * width, rows[group].T.ravel(), inputs[group].T.ravel(), variance, out.reshape(-1))
-        parts.append(out.T)
-    return np.concatenate(parts)
-
-
-def test_a_run_has_the_same_bits_whatever_its_neighbours_and_on_the_scalar_machine():
-    """Neighbours that take both rows at once, one after the other, or need the precise form or a large reset, in every mixture."""
-    runs = 48
-    rows = np.concatenate([states().T.reshape(STATE, WIDTH).T for _ in range(runs // WIDTH)])
-    scale = 10.0 ** RANDOM.uniform(-3.0, 2.0, runs)
-    rows[:, 7:] *= scale[:, None]
-    inputs = np.concatenate([0.05 * RANDOM.standard_normal((runs, 3)), RANDOM.standard_normal((runs, 3))], axis=1)
-    variance = 1e-4
-    over_lanes, scalar = kernel(stepped), kernel(stepped_scalars)
-    alone = np.empty((runs, 32))
-    for row, value, out in zip(rows, inputs, alone, strict=True):
-        scalar(row, value, variance, out)
-    variances = alone[:, [29, 31]]
-    together = variances.sum(axis=1) < 1000.0 * variance
-    assert 8 < np.sum(together) < runs - 8  # both forms are met
-    for width in (1, 8):
-        np.testing.assert_array_equal(in_lanes(over_lanes, rows, inputs, variance, width), alone)
-    for _ in range(5):
-        order = RANDOM.permutation(runs)
-        np.testing.assert_array_equal(in_lanes(over_lanes, rows[order], inputs[order], variance, WIDTH), alone[order])
-    plain = np.empty(32)
-    for row, value, fast in zip(rows[:8], inputs[:8], alone[:8], strict=True):
-        stepped_scalars(row, value, variance, plain)
-        np.testing.assert_allclose(fast, plain, rtol=1e-9, atol=1e-12)
 
 
 # ---------------------------------------------------------------------------------------------------- any width of machine

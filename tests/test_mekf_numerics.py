@@ -10,25 +10,18 @@ import mpmath
 import numpy as np
 import pytest
 from measured import EVERY_KIND, STAR, SWAY, record_of, resting, seen, series_of, turn_to, unit
-from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from square_root import SquareRootFilter
 
 from strapdown import estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.schedule import schedule
-from strapdown.estimation.states import GateMemory, ProcessNoise, covariance_matrices, initial_state, pack
-from strapdown.estimation.step_filter import StepFilter
-from strapdown.gyro import GyroSpec
-from strapdown.kernels import gate_rules, six_states
+from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state
+from strapdown.kernels import gate_rules
 from strapdown.kernels.gate_rules import CANDIDATE
-from strapdown.kernels.measurement import SIGMA_ORIGIN, VALUE_ORIGIN
-from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
-from strapdown.scenarios import Scenario, simulate
 from strapdown.units import ARCSECOND
-from strapdown.vectors import VectorMeasurements, VectorSensor
+from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 
@@ -147,24 +140,6 @@ def test_a_filter_that_has_recovered_refuses_it_too(sigma):
     start = replace(initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=0.1), gate=memory)
     with pytest.raises(InputError, match=REFUSED) if sigma < 1e-3 else nullcontext():
         estimation.run(resting(series), NOISE, start, gate=OPTIONS)
-
-
-@pytest.mark.parametrize(("exponent", "gate"), DECADES, ids=NAMES)
-def test_the_covariance_is_that_of_the_information_form(exponent, gate):
-    """(I/σ₀² + Σ (I − r rᵀ)/σ²)⁻¹ of three directions at one time."""
-    sigma = 10.0**exponent
-    references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
-    series = tuple(series_of(f"s{k}", "direction", [0.0], [r], r, sigma) for k, r in enumerate(references))
-    record = resting(*series)
-    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
-    estimate = taken_or_refused(sigma, record, NOISE, start, gate=gate)
-    if estimate is None:
-        return
-    P = estimate.covariance[0, :3, :3]
-    information = np.eye(3) + sum(np.eye(3) - np.outer(r, r) for r in references) / sigma**2
-    expected = np.linalg.inv(information)
-    d = np.sqrt(np.diag(expected))
-    assert np.abs((P - expected) / np.outer(d, d)).max() < 1e-9
 
 
 def reference_variances(record, noise, prior):
@@ -297,22 +272,6 @@ def test_a_gate_recovers_with_sharp_measurements_and_in_parts(gate):
     assert any(challenged)
 
 
-def test_the_covariance_is_carried_through_large_corrections():
-    """A start a third of a radian off and sharp directions: the covariance's reset is that of the step face."""
-    record, truth = sharp_record(1e-5, steps=6)
-    off = quaternion.multiply(truth[0], quaternion.exp([0.3, -0.2, 0.1]))
-    start = initial_state(off, attitude_sigma=0.5, bias_sigma=0.01)
-    estimate = estimation.run(record, NOISE, start)
-    f = StepFilter(NOISE, start)
-    for k, now in enumerate(record.time[1:]):
-        f.predict(record.increments[k], now - record.time[k])
-        for s in record.vectors:
-            for at in np.flatnonzero(s.time == now):
-                f.update(s, at)
-        assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k + 1])) < 1e-9
-        assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
-
-
 @pytest.mark.parametrize("states", [(), EVERY_KIND], ids=["six", "more"])
 @pytest.mark.parametrize("angle", [0.3, 0.6, 0.95, 1.5])
 def test_a_large_correction_is_exact(states, angle):
@@ -440,69 +399,6 @@ def test_positive_definite_and_steady_over_a_long_run(parts, steps):
     assert np.abs((P - P[0]) / np.outer(d, d)).max() < 1e-9
     # The last corrections are rounding.
     assert np.max(quaternion.angle_between(whole.attitude, body.attitude(time[:: steps // 10]))) < 1e-9
-
-
-def run_plain(record, start, dtype):
-    """Run the kernel's source in plain Python, with every number of one type."""
-    events = schedule(record.vectors, record.time[0], record.time[-1])
-    n = len(record.increments)
-
-    def of(value):
-        return np.asarray(value, dtype)
-
-    outputs = [np.empty((n + 1, width), dtype) for width in (4, 3, 6, 21)]
-    out = six_states.Outputs(*outputs, np.empty((len(events.row), 6), dtype), np.empty((0, 32), dtype))
-    state = of(pack(start.attitude, start.bias, start.covariance))
-    body = six_states.Body(state, dtype(NOISE.angle_random_walk**2), dtype(NOISE.rate_random_walk**2))
-    measured = events.measurements
-    columns = measured.series.copy()
-    columns[:, VALUE_ORIGIN] = columns[:, SIGMA_ORIGIN] = 0  # one sensor after the other, as they stand here
-    measured = measured._replace(
-        time=of(measured.time),
-        value=of(np.concatenate(events.series_vector_b)).reshape(-1),
-        sigma=of(np.concatenate(events.series_sigma)),
-        series=columns,
-        triads=of(measured.triads),
-    )
-    plain(walk, six_states)(of(record.time), of(record.increments), measured, 1, body, out)
-    return outputs
-
-
-def test_single_precision_is_good_to_a_hundredth_of_a_sigma():
-    """The same source in float32, against float64: a MEMS filter over 4 s, stars to 1e-3 rad and a start to 0.1 rad.
-
-    Found: attitude off by 4.5e-7 rad at most, a thousandth of its σ; bias by 0.4 % of its σ; σ by 3e-5; P positive definite throughout.
-    With measurements to 1e-6 rad, whose variance is lost in the rounding of P, σ is wrong by more than a tenth. Times should stay double:
-    in single a stamp may change sides with an edge.
-    """
-    sensors = tuple(
-        VectorSensor(name=name, reference_f=np.array(r), sigma=1e-3, rate=5.0)
-        for name, r in (("a", [1.0, 0.2, 0.0]), ("b", [0.0, 1.0, 1.0]))
-    )
-    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias=np.array([1e-3, -2e-3, 5e-4]))
-    record = simulate(
-        Scenario(motion=motion.Coning(angle=0.3, frequency=0.3), gyro=spec, sensors=sensors, rate=25.0, duration=4.0), 1
-    )
-    at_edges = tuple(replace(s, time=record.time[np.searchsorted(record.time, s.time - 1e-9)]) for s in record.vectors)
-    record = replace(record, vectors=at_edges)
-    start = initial_state(record.truth.attitude[0], attitude_sigma=0.1, bias_sigma=3e-3)
-    q, b, variance, blocks = run_plain(record, start, np.float32)
-    q64, b64, variance64, _ = run_plain(record, start, np.float64)
-    assert q.dtype == np.float32
-    whole = estimation.run(record, NOISE, start)
-    assert np.abs(q64 - whole.attitude).max() < 1e-13  # the plain source and the compiled one
-    sigma = np.sqrt(variance64)
-    off = quaternion.angle_between(quaternion.normalize(q.astype(np.float64)), q64)
-    assert off.max() < 2e-6
-    assert np.max(off / np.linalg.norm(sigma[:, :3], axis=1)) < 0.01
-    assert np.max(np.abs(b - b64) / sigma[:, 3:]) < 0.02
-    assert np.max(np.abs(np.sqrt(variance) / sigma - 1.0)) < 2e-4
-    assert least_eigenvalue(covariance_matrices(blocks.astype(np.float64))) > 0.0
-    sharp = replace(record, vectors=tuple(replace(s, sigma=np.full(len(s.time), 1e-6)) for s in record.vectors))
-    _, _, broken, _ = run_plain(sharp, start, np.float32)
-    _, _, right, _ = run_plain(sharp, start, np.float64)
-    at = np.searchsorted(record.time, sharp.vectors[0].time)
-    assert np.max(np.abs(broken[at, :3] / right[at, :3] - 1.0)) > 0.1
 
 
 @pytest.mark.parametrize("sigma", [3e-7, 1e-6])

@@ -7,20 +7,17 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import correlation, drawn_start, errors, resting, series_of
+from measured import correlation, drawn_start, errors
 
-from strapdown import consistency, estimation, kinematics, montecarlo, motion, quaternion
-from strapdown.checks import InputError
+from strapdown import consistency, estimation, montecarlo, motion, quaternion
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
+from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 OUTLIERS = Faults(outlier_probability=0.1, outlier_scale=10.0)
@@ -308,17 +305,6 @@ def test_both_faces_restart_and_report_lock_outs_alike(case):
         assert (mine.start, mine.end, mine.value) == pytest.approx((other.start, other.end, other.value))
 
 
-def test_a_repeated_gyro_sample_changes_nothing_and_is_counted():
-    record = simulate(scenario((), duration=0.1), 5)
-    f = GatedStepFilter(NOISE, near(record))
-    f.predict(record.increments[0], 0.02)
-    attitude, P = f.attitude.copy(), f.P.copy()
-    f.predict(record.increments[0], 0.0)
-    assert f.repeated == 1
-    assert np.array_equal(f.attitude, attitude)
-    assert np.array_equal(f.P, P)
-
-
 def test_a_gap_of_the_gyro_is_reported_and_grows_the_covariance_as_the_closed_form_says():
     dt, T = 0.02, 40.0
     edges = np.concatenate([dt * np.arange(51), 1.0 + T + dt * np.arange(50)])
@@ -333,74 +319,3 @@ def test_a_gap_of_the_gyro_is_reported_and_grows_the_covariance_as_the_closed_fo
     v, u, time = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2, 1.0 + T
     assert after[0, 0] == pytest.approx(1e-6 + 1e-8 * time**2 + v * time + u * time**3 / 3.0, rel=1e-10)
     assert after[3, 3] == pytest.approx(1e-8 + u * time, rel=1e-10)
-
-
-def test_an_outage_of_all_measurements_grows_the_covariance_and_ends_consistent():
-    chosen = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
-    record = simulate(scenario(chosen, duration=4.0), 5)
-    estimate = estimation.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
-    assert not sum(estimate.refused.values())
-    growth = estimate.variance[149, 3:] - estimate.variance[50, 3:]
-    assert np.allclose(growth, NOISE.rate_random_walk**2 * (estimate.time[149] - estimate.time[50]), rtol=1e-9)
-
-
-def test_a_constant_covariance_is_one_for_each_sample():
-    record = simulate(scenario(sensors(Faults())["vector"], duration=1.0), 5)
-    C = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 1.0]]) * 1e-3
-    force, other = record.vectors
-    once = replace(force, sigma=0.0, covariance=C)
-    each = replace(force, sigma=0.0, covariance=np.tile(C, (len(force.time), 1, 1)))
-    assert np.allclose(once.sigma, np.sqrt(np.trace(C) / 3.0))
-    results = [
-        estimation.run(replace(record, vectors=(s, other)), NOISE, near(record), full_covariance=True)
-        for s in (once, each)
-    ]
-    assert np.array_equal(results[0].covariance, results[1].covariance)
-    turned = estimation.run(
-        replace(record, vectors=(once.noise_scaled(2.0), other)), NOISE, near(record), full_covariance=True
-    )
-    assert np.trace(turned.covariance[-1]) > np.trace(results[0].covariance[-1])
-
-
-def test_a_covariance_proportional_to_one_is_a_sigma():
-    record = simulate(scenario(SCHEDULES["asynchronous"](sensors(Faults())["vector"]), duration=1.0), 5)
-    vectors = tuple(replace(s, sigma=0.0, covariance=s.sigma[0] ** 2 * np.eye(3)) for s in record.vectors)
-    one = estimation.run(record, NOISE, near(record), full_covariance=True)
-    other = estimation.run(replace(record, vectors=vectors), NOISE, near(record), full_covariance=True)
-    assert_same(one, other.attitude[1:], other.bias[1:], other.covariance[1:], 1e-12)
-
-
-def test_correlated_noise_is_decorrelated_exactly():
-    """One vector and a diffuse prior about one axis: the information matrix of the textbook, (Hᵀ C⁻¹ H + P⁻¹)⁻¹."""
-    r = np.array([0.0, 0.0, 9.81])
-    C = np.array([[4.0, 1.0, -1.5], [1.0, 2.0, 0.5], [-1.5, 0.5, 2.0]]) * 1e-2
-    series = VectorMeasurements(
-        sensor="f", kind="vector", time=[0.0], vector_b=[r + np.array([0.05, -0.08, 0.1])], reference_f=r, covariance=C
-    )
-    record = resting(series)
-    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
-    result = estimation.run(record, NOISE, start, full_covariance=True)
-    H = np.array([[0.0, -r[2], 0.0], [r[2], 0.0, 0.0], [0.0, 0.0, 0.0]])  # z = r + [r] δθ
-    P = np.linalg.inv(H.T @ np.linalg.solve(C, H) + np.eye(3) / 0.01)
-    x = P @ H.T @ np.linalg.solve(C, np.array([0.05, -0.08, 0.1]))
-    assert np.allclose(quaternion.log(result.attitude[0]), x, rtol=1e-9, atol=1e-12)
-    nis = np.array([0.05, -0.08, 0.1]) @ np.linalg.solve(H @ H.T * 0.01 + C, np.array([0.05, -0.08, 0.1]))
-    assert result.innovations["f"].nis[0] == pytest.approx(nis, rel=1e-12)
-    J = kinematics.right_jacobian(x)
-    assert np.allclose(result.covariance[0][:3, :3], J @ P @ J.T, rtol=1e-9, atol=1e-15)
-
-
-def test_a_schedule_of_one_sigma_takes_no_noise_by_axis():
-    series = replace(series_of("s", "direction", [0.5], [[1.0, 0, 0]], [1.0, 0, 0], 0.0), sigma_axes=[1.0, 0.0, 1.0])
-    with pytest.raises(InputError, match="one sigma per sample"):
-        schedule((series,), 0.0, 1.0)
-
-
-@pytest.mark.parametrize("whole", [False, True], ids=["per axis", "covariance"])
-def test_anisotropic_noise_goes_through_a_record_file(tmp_path, whole):
-    record = anisotropic(simulate(scenario(sensors()["vector"], duration=1.0), 5), whole)
-    recordfiles.write_record(tmp_path / "r.h5", record)
-    back = recordfiles.read_record(tmp_path / "r.h5")
-    for series, other in zip(record.vectors, back.vectors, strict=True):
-        assert np.array_equal(series.covariances, other.covariances)
-        assert np.array_equal(series.sigma, other.sigma)

@@ -79,8 +79,13 @@ def test_the_replay_is_the_run_bit_for_bit():
         wanted = nees(e[:, part], P[:, part, part])
         np.testing.assert_allclose(chunk.nees_sum[:, column], wanted, rtol=1e-8)
         np.testing.assert_allclose(chunk.log_nees_sum[:, column], np.log(wanted), atol=1e-8)
+        if column == 0:
+            assert chunk.worst_score.tolist() == pytest.approx([wanted.max()], rel=1e-8)
     nis = np.array([innovations.nis.sum() for innovations in estimate.innovations.values()])
     np.testing.assert_allclose(chunk.sensor_nis_sum.sum(axis=1), nis, rtol=1e-9)
+    eight = lanes.run_chunk(PLAN, 0, 8)  # all of which are kept
+    inside = np.abs(eight.example_error)[..., None] <= np.array([1.0, 2.0, 3.0]) * eight.example_sigma[..., None]
+    np.testing.assert_array_equal(eight.coverage, inside.sum(axis=0))
 
 
 def test_the_scalar_filter_makes_the_same_of_the_replayed_record():

@@ -74,7 +74,7 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
 
 
 def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
-    source = sd.write(sd.simulate("spin", seed=5), tmp_path / "record.h5")
+    source = sd.write(sd.simulate("two-stars", seed=5), tmp_path / "record.h5")
     for name, flags, estimator, options in (
         ("smooth", ("--smooth",), sd.smooth, {}),
         ("gate", ("--gate", "0.99"), sd.estimate, {"gate": 0.99}),

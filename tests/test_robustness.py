@@ -9,7 +9,6 @@ from measured import assert_inside, drawn_start, errors, recoveries, turn_to
 from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
-from strapdown.checks import InputError
 from strapdown.estimation import gating, setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
@@ -106,32 +105,6 @@ def test_isolated_outliers_are_refused_and_start_no_recovery():
     assert 0.15 < share < 0.25
     rms = [np.sqrt(np.mean(errors(e, record.truth)[500:, :3] ** 2)) for e in (gated, plain)]
     assert rms[0] < 0.2 * rms[1]
-
-
-def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
-    record = simulate(scenario(duration=2.0), 1)
-    a, b = record.vectors
-    wrong = a.vector_b.copy()
-    wrong[7] = -wrong[7]
-    missing = a.vector_b.copy()
-    missing[7] = np.nan
-    start = started(record, 0)
-    gate = Gate(probability=1.0 - 1e-9)
-    one = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
-    other = estimation.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
-    assert np.array_equal(one.attitude, other.attitude)
-    assert np.array_equal(one.variance, other.variance)
-    assert one.refused == {"a": 1, "b": 0}
-    assert other.skipped == {"a": 1, "b": 0}
-
-
-def test_a_gate_that_refuses_nothing_is_the_plain_filter():
-    record = simulate(scenario(), 1)
-    start = started(record, 0)
-    plain = estimation.run(record, NOISE, start, full_covariance=True)
-    gated = estimation.run(record, NOISE, start, full_covariance=True, gate=Gate(probability=1.0 - 1e-14))
-    assert np.allclose(plain.attitude, gated.attitude, rtol=0.0, atol=1e-13)
-    assert np.allclose(plain.covariance, gated.covariance, rtol=1e-9, atol=1e-20)
 
 
 # ------------------------------------------------------------------------------------------------------------------------- recovery
@@ -633,24 +606,6 @@ def test_robust_smoothing_is_better_and_consistent():
     assert squares[0] < 0.7 * squares[1]
     assert squares[0] < 0.4 * squares[2]
     assert 0.7 < nees < 1.7
-
-
-BAD = {
-    "certain": (lambda: Gate(probability=1.0), "between 0 and 1"),
-    "one refusal": (lambda: Gate(recovery=1), "recovery"),
-    "no sigma": (lambda: Gate(restart_attitude_sigma=0.0), "restart_attitude_sigma"),
-    "no bias sigma": (lambda: Gate(restart_bias_sigma=0.0), "restart_bias_sigma"),
-    "unknown": (lambda: Robust(kind="hubert"), "did you mean 'huber'"),
-    "no degrees": (lambda: Robust(degrees_of_freedom=0.0), "degrees_of_freedom"),
-    "no passes": (lambda: Robust(iterations=0), "iterations"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_named(case):
-    make, words = BAD[case]
-    with pytest.raises(InputError, match=words):
-        make()
 
 
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():

@@ -62,42 +62,6 @@ def test_the_gate_of_a_setup_is_that_of_its_filter():
     assert setup.run(record, filter_setup, start).refused[first.sensor] == 0
 
 
-@pytest.mark.parametrize(
-    ("table", "complaint"),
-    [
-        ({"bias_sigma_deg_per_hour": 1.0}, "angle_random_walk_deg_per_sqrt_hour is missing"),
-        ({"angle_random_walk_deg_per_sqrt_hour": 0.1, "rate_random_walk_rad_per_s_per_sqrt_s": 0.0}, "bias_sigma"),
-        ({"angle_random_walk_deg_per_hour": 0.1}, "angle_random_walk_deg_per_sqrt_hour"),
-        ({"integration": "four"}, "four-sample"),
-        ({"sigma": 3.0}, "must be a table"),
-        ({"sigma": {"star": "big"}}, "sigma: star"),
-        ({"sigma": {"star": [1e-4, 1e-4]}}, "sigma: star has 2 numbers; give one, or three"),
-        ({"sigma": {"star": [1e-4, 1e-4, "1e-4"]}}, "sigma: star: z is '1e-4'"),
-        ({"gate": 0.99}, "must be a table"),
-        ({"gate": {"probabilty_ratio": 0.9}}, "probability_ratio"),
-        ({"robust": {"kind": "hubr"}}, "huber"),
-    ],
-)
-def test_a_bad_table_is_refused_by_name(table, complaint):
-    with pytest.raises(InputError, match=complaint):
-        setup.from_table(table)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"attitude_sigma": 0.0}, {"bias_sigma": -1.0}, {"sigma": {"star": 0.0}}, {"sigma": {"star": (1e-4, 0.0, 1e-4)}}],
-)
-def test_no_sigma_may_be_zero(change):
-    with pytest.raises(InputError, match="greater than zero"):
-        dataclasses.replace(SETUP, **change)
-
-
-@pytest.mark.parametrize(("name", "value"), [("integration", "four-sample"), ("process_noise", 1e-4)])
-def test_a_part_of_another_class_is_refused_by_name(name, value):
-    with pytest.raises(InputError, match=f"{name} is .*, not of class"):
-        dataclasses.replace(SETUP, **{name: value})
-
-
 def test_a_sigma_beyond_half_a_turn_is_refused_of_angles_alone():
     wide = dataclasses.replace(SETUP, sigma={"star": (1e-4, 3.2, 1e-4)})
     for kind in ("direction", "heading", "attitude"):
@@ -144,11 +108,6 @@ def test_beside_states_the_rate_random_walk_is_that_of_the_worst_axis_alone():
         noise = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=True).process_noise
         assert noise.rate_random_walk == pytest.approx(sigma, rel=1e-12)
         assert noise.angle_random_walk == pytest.approx(2e-5, rel=1e-12)
-
-
-def test_a_gyro_without_noise_is_refused():
-    with pytest.raises(InputError, match="angle random walk"):
-        setup.FilterSetup.for_scenario(scenario(gyro=GyroSpec()), states=False)
 
 
 def test_measurement_density_counts_what_each_kind_measures():

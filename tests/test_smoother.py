@@ -8,7 +8,6 @@ import filterpy.kalman
 import mpmath
 import numpy as np
 import pytest
-from in_steps import transition_and_noise
 from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit, waves
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
@@ -17,7 +16,7 @@ from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation.error_states import GyroScale
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
-from strapdown.kernels import rotation, smoother_loop, smoother_step
+from strapdown.kernels import smoother_loop
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.vectors import VectorMeasurements, triad
@@ -571,51 +570,6 @@ def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_re
 # ------------------------------------------------------------------------------------------------------------------------ kernels
 
 
-def angles(rng: np.random.Generator) -> np.ndarray:
-    return np.concatenate(
-        [
-            [0.0],
-            10.0 ** rng.uniform(-12, math.log10(math.pi), 60),
-            [(1.0 - 1e-9) * LARGEST_ANGLE, (1.0 + 1e-9) * LARGEST_ANGLE, 3.14],
-        ]
-    )
-
-
-def blocks(P: np.ndarray) -> tuple:
-    upper = np.triu_indices(3)
-    return tuple(P[:3, :3][upper]), tuple(P[:3, 3:].ravel()), tuple(P[3:, 3:][upper])
-
-
-def random_covariance(rng: np.random.Generator, decades: float = 1.0) -> np.ndarray:
-    turn, _ = np.linalg.qr(rng.standard_normal((6, 6)))
-    scale = np.diag(np.repeat([1e-2, 1e-4], 3))
-    return scale @ (turn * 10.0 ** rng.uniform(-decades, 0.0, 6)) @ turn.T @ scale
-
-
-def test_composed_rotations_at_any_angle() -> None:
-    # Both lengths of the series on both sides of their bounds; the oracle in 40 digits.
-    rng = np.random.default_rng(1)
-    near = np.array([0.005, 0.01])
-    sizes = np.concatenate([angles(rng), (1.0 - 1e-6) * near, (1.0 + 1e-6) * near])
-    axes = rng.standard_normal((2, len(sizes), 3))
-    for one, other, first, second in zip(sizes, rng.permutation(sizes), *axes, strict=True):
-        with mpmath.workdps(40):
-            halves = [mpmath.mpf(float(angle)) / 2 for angle in (one, other)]
-            u, v = (
-                mpmath.matrix(axis.tolist()) / mpmath.norm(mpmath.matrix(axis.tolist())) for axis in (first, second)
-            )
-            (c, d), (s, t) = ([of(half) for half in halves] for of in (mpmath.cos, mpmath.sin))
-            cross = mpmath.matrix([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-            w, vector = c * d - s * t * (u.T * v)[0], s * d * u + c * t * v + s * t * cross
-            size = mpmath.norm(vector)
-            angle = 2 * mpmath.atan2(size, abs(w))
-            expected = [float(mpmath.sign(w) * angle * x / size) if size else 0.0 for x in vector]
-            r = (float(c), *(float(s * x) for x in u))
-            phi = [float(2 * halves[1] * x) for x in v]
-        if angle < 3.1:  # else its sign hangs on the rounding of the arguments
-            np.testing.assert_allclose(rotation.composed(r, tuple(phi)), expected, rtol=0, atol=1e-15 * (one + other))
-
-
 @pytest.mark.parametrize("intervals", [*range(1, 11), 16, 17])
 def test_any_number_of_segments(intervals: int) -> None:
     # Segments are taken in groups of eight, the last of which may be smaller.
@@ -643,39 +597,6 @@ def test_corrections_beyond_the_series(angle: float) -> None:
     moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), one.attitude))
     assert (np.linalg.norm(moved, axis=1).max() > LARGEST_ANGLE) == (angle > 0.35)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
-
-
-@pytest.mark.parametrize("decades", [2.0, 8.0, 12.0])
-def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decades: float) -> None:
-    # Against the textbook's gain in 60 digits; no Jacobian takes part where the predicted and the smoothed attitude agree.
-    rng = np.random.default_rng(0)
-    dt, sv, su = 0.01, 1e-5, 1e-8
-    noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
-    turn = np.array([0.01, -0.02, 0.03])
-    F, Q = transition_and_noise(turn, dt, noise)
-    worst_textbook = 0.0
-    for _ in range(5):
-        P = random_covariance(rng, decades)
-        P_next = 0.25 * (F @ P @ F.T + Q)
-        q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, sv**2, su**2)
-        N = smoother_step.kept_share(*blocks(P), q11, q12, q22)
-        gains = smoother_step.gain(N, tuple(turn), dt)
-        G = np.block([[np.reshape(g, (3, 3)) for g in pair] for pair in (gains[:2], gains[2:])])
-        D_tt, D_tb, D_bb = smoother_step.left_noise(N, q11, q12, q22)
-        found = G @ P_next @ G.T + covariance_matrices(np.array([*D_tt, *D_tb, *D_bb]))
-        with mpmath.workdps(60):
-            p, f, r, n = (mpmath.matrix(m.tolist()) for m in (P, F, Q, P_next))
-            predicted = f * p * f.T + r
-            gain = p * f.T * predicted**-1
-            exact = p + gain * (n - predicted) * gain.T
-            expected = np.array(exact.tolist(), dtype=float)
-        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        assert np.max(np.abs(found - expected) / scale) < 1e-10
-        gain = P @ F.T @ np.linalg.inv(F @ P @ F.T + Q)
-        plain = P + gain @ (P_next - F @ P @ F.T - Q) @ gain.T
-        worst_textbook = max(worst_textbook, np.max(np.abs(plain - expected) / scale))
-        assert np.linalg.eigvalsh(found / scale)[0] > 0.0
-    assert decades < 12.0 or worst_textbook > 1e-8  # what the other form is for
 
 
 def test_edges_are_found_exactly() -> None:

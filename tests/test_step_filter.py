@@ -4,16 +4,14 @@ import functools
 import pickle
 from dataclasses import replace
 
-import in_steps
 import numpy as np
 import pytest
-from filterpy.common import Saver
 from gated_steps import GatedStepFilter
 from measured import resting, sample, series_of
 
-from strapdown import estimation, motion, quaternion, records
+from strapdown import estimation, motion, quaternion
 from strapdown.checks import InputError
-from strapdown.estimation import error_states, filters, multiple_model
+from strapdown.estimation import error_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
@@ -62,15 +60,6 @@ def record_of(duration=2.0):
     return simulate(scenario, 5)
 
 
-def handed_over(record, initial, states=(), **options):
-    """Run the filter over a record."""
-    names = {"sensors": [s.sensor for s in record.vectors]} if states else {}
-    face = GatedStepFilter if options.keys() & {"gate", "robust"} else StepFilter
-    f = face(NOISE, initial, states, time=record.time[0], **names, **options)
-    in_steps.fed(f, record)
-    return f
-
-
 OPTIONS = {
     "plain": {},
     "gate, Student": {"gate": Gate(probability=0.9999), "robust": Robust(degrees_of_freedom=3.0)},
@@ -82,24 +71,6 @@ def begun(record, option):
     error = (1.0, 0.5, -1.0) if option == "lost" else (0.05, -0.06, 0.07)
     attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
-
-
-@pytest.mark.parametrize(
-    ("option", "states"),
-    [
-        pytest.param(option, states, marks=[] if (option, states) == ("plain", "none") else pytest.mark.slow)
-        for option in OPTIONS
-        for states in STATES
-    ],
-)
-def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
-    record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]
-    initial = begun(record, option)
-    face = handed_over(record, initial, blocks, **given)
-    estimate = estimation.run(record, NOISE, initial, blocks, **given)
-    assert quaternion.angle_between(estimate.attitude[-1], face.attitude) < (1e-9 if blocks else 1e-10)
-    if blocks:
-        assert bool(getattr(face, "events", ())) == (option == "lost")
 
 
 IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
@@ -121,41 +92,6 @@ def test_the_clock_of_given_stamps_is_theirs():
     assert other.time == pytest.approx(stamps[-1], abs=200 * np.spacing(1.7e9))
     f.predict([0.0, 0.0, 1e-3], time=stamps[-1])
     assert f.repeated == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({}, "give either dt"),
-        ({"time": 0.5}, r"time is 0.5 s, before the filter's 1 s"),
-        ({"dt": 0.1, "time": 1.1}, "give either dt"),
-        ({"dt": -0.1}, "dt is -0.1 s; it must not be negative"),
-        ({"dt": 0.1, "delta_theta": [0.0, np.nan, 0.0]}, r"delta_theta\[1\] is nan"),
-    ],
-)
-def test_steps_that_contradict_the_clock_are_refused(arguments, message):
-    f = StepFilter(NOISE, start(), time=1.0)
-    with pytest.raises(InputError, match=message):
-        f.predict(**{"delta_theta": np.zeros(3), **arguments})
-    assert f.time == 1.0
-
-
-def test_turns_that_nothing_makes_are_refused():
-    f = StepFilter(NOISE, start())
-    for turn in (1e200, -2e6):
-        with pytest.raises(InputError, match="too large for the rotation between two samples"):
-            f.predict([0.0, turn, 0.0], 0.01)
-    assert f.time == 0.0
-
-
-def test_filterpys_own_updates_are_refused():
-    f = StepFilter(NOISE, start())
-    H = np.eye(6)[:2]
-    for update in (f.update, f.predict_update):
-        with pytest.raises(InputError, match=r"series is .*not of class VectorMeasurements"):
-            update(np.array([0.5, 0.0]), lambda x: H)
-    assert np.array_equal(f.x, np.zeros(6))
-    assert f.update(sample("direction", X, X, 0.1))
 
 
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
@@ -199,36 +135,7 @@ def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(value, 
     assert face.update(sample("direction", X, X, 0.1, "mag"))
 
 
-def test_the_sensors_of_a_filter_with_error_states_can_be_named():
-    block = error_states.VectorBias(sensor="mag", bias_sigma=0.01)
-    face = StepFilter(NOISE, start(), (block,), sensors=("acc", "mag"))
-    assert face.update(sample("direction", UP, UP, 0.1, "acc"))
-    with pytest.raises(InputError, match="sensor 'up' is not known"):
-        face.update(sample("direction", UP, UP, 0.1, "up"))
-    with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
-        StepFilter(NOISE, start(), (block,), sensors=("acc", "Mag"))
-    for blocks in ((block,), ()):
-        with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
-            StepFilter(NOISE, start(), blocks, sensors="mag")
-    # Blocks that are about no sensor leave the names free.
-    free = StepFilter(NOISE, start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
-    assert free.update(sample("direction", UP, UP, 0.1, "any"))
-
-
 VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-def test_a_vertical_measured_heading_is_skipped_and_counted(options):
-    f = GatedStepFilter(NOISE, start(), **options)
-    for k in range(1, 6):
-        f.predict(np.zeros(3), time=0.1 * k)
-        assert not f.update(sample("heading", UP, X, 0.1, "north"))
-    assert f.skipped == {"north": 5}
-    assert f.refused == {}
-    assert f.events == ()
-    assert f.update(sample("heading", X, X, 0.1, "north"))
 
 
 UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
@@ -272,7 +179,7 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
     f.predict(np.zeros(3), time=0.5)
     P = f.P.copy()
-    for value in ([np.nan] * 3, [0.0, np.nan, 1.0]):
+    for value in ([np.nan] * 3, UP if kind == "heading" else [0.0, np.nan, 1.0]):  # a vertical vector has no heading
         if kind == "attitude":
             series = VectorMeasurements(sensor="s", kind=kind, time=[0.0], attitude=[[*value, 1.0]], sigma=0.1)
         else:
@@ -282,176 +189,3 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     assert np.array_equal(f.P, P)
     with pytest.raises(IndexError):
         f.update(series, 1)
-
-
-def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
-    """Rows of NaN, with whatever else is unknown of them, and the record without these rows."""
-    record = record_of(1.0)
-    tracker = record.vectors[2]
-    gone = np.zeros(len(tracker.time), bool)
-    gone[[0, 3, 4, 9]] = True
-    measured, axes = tracker.attitude.copy(), tracker.sigma_axes.copy()
-    measured[gone, 2], axes[gone, 1] = np.nan, np.nan
-    holed = replace(tracker, attitude=measured, sigma_axes=axes)
-    others = (record.vectors[0], record.vectors[3])
-    initial = initial_state(record.truth.attitude[0], attitude_sigma=0.01, bias_sigma=3e-3)
-    runs = [
-        estimation.run(replace(record, vectors=(*others, one)), NOISE, initial, full_covariance=True)
-        for one in (holed, tracker.taken(~gone))
-    ]
-    assert runs[0].skipped == {"a": 0, "b": 0, "tracker": 4}
-    assert np.array_equal(runs[0].covariance, runs[1].covariance)
-    assert np.array_equal(runs[0].attitude, runs[1].attitude)
-    found = estimation.first_state(replace(record, vectors=(holed,)), NOISE, bias_sigma=1e-3)
-    assert quaternion.angle_between(found.attitude, record.truth.attitude[0]) < 0.2
-
-
-# ------------------------------------------------------------------------------- from part to part, and what is kept beside it
-
-
-def lost_record():
-    """A start that is off by a radian, and two directions to recover by."""
-    record = record_of(3.0)
-    record = replace(record, vectors=(record.vectors[0], record.vectors[3]))
-    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp((1.0, 0.5, -1.0)))
-    return record, initial_state(attitude, attitude_sigma=1e-2, bias_sigma=3e-3)
-
-
-def test_the_step_face_goes_on_from_a_part_as_the_record_does():
-    """The gate's whole memory goes along: a candidate between, refusals counted, and lock-outs that go on."""
-    record, initial = lost_record()
-    gate, challenged, recovered = Gate(recovery=12), 0, 0
-    whole = estimation.run(record, NOISE, initial, gate=gate)
-    (recovery,) = [event for event in whole.events if event.kind == "recovery"]
-    for cut in (5, 10, 20, 60):
-        first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
-        _, middle = estimation.run_part(first, NOISE, initial, gate=gate)
-        second, end = estimation.run_part(rest, NOISE, middle, gate=gate)
-        challenged += int(middle.gate.counts[0])
-        face = handed_over(rest, middle, gate=gate)
-        assert quaternion.angle_between(face.attitude, end.attitude) < 1e-10
-        assert np.abs(face.bias - end.bias).max() < 1e-10
-        d = np.sqrt(np.diag(end.covariance))
-        assert np.abs((face.P - end.covariance) / np.outer(d, d)).max() < 1e-9
-        judged = [event for event in second.events if event.kind != "gap"]
-        assert sorted(map(str, face.events)) == sorted(map(str, judged))
-        recovered += recovery in face.events
-    assert challenged >= 2
-    assert recovered >= 2
-
-
-@pytest.mark.parametrize("states", STATES)
-def test_saver_and_pickle(states):
-    """Before the first measurement too, and with events that come meanwhile."""
-    record, initial = lost_record()
-    options = {"gate": Gate(recovery=4)}
-    f = GatedStepFilter(NOISE, initial, STATES[states], sensors=("a", "b"), **options)
-    history = Saver(f, save_current=True)
-    for k, t in enumerate(record.vectors[0].time):
-        if t > f.time:
-            now, then = np.searchsorted(record.time, [f.time, t])
-            f.predict(record.increments[now:then].sum(axis=0), time=t)
-        for series in record.vectors:
-            f.update(replace(series, sigma=np.full(len(series.time), 2e-3)), k)
-        history.save()
-    assert {event.kind for event in f.events} >= {"recovery"}
-    assert f.refused
-    history.to_array()
-    n, m = len(record.vectors[0].time) + 1, len(f.values)
-    assert m == (9 if STATES[states] else 0)
-    assert history.P.shape == (n, 6 + m, 6 + m)
-    assert history.K.shape == (n, 6 + m, 2)
-    assert history.attitude.shape == (n, 4)
-    assert history.values.shape == (n, m)
-    copy = pickle.loads(pickle.dumps(f))
-    for one in (f, copy):
-        one.update(sample("direction", X, X, 0.5, "a"))
-    assert np.array_equal(copy.P, f.P)
-    assert np.array_equal(copy.attitude, f.attitude)
-    assert copy.events == f.events
-
-
-# ------------------------------------------------------------------------------------------------------------ what is no argument
-
-SERIES = series_of("s", "direction", [0.5], [X], X, 0.1)
-RECORD = resting(SERIES)
-
-WRONG = {
-    "two sigmas": (
-        lambda: initial_state(IDENTITY, attitude_sigma=[1.0, 2.0], bias_sigma=1.0),
-        r"attitude_sigma has shape \(2,\); give one number, or three",
-    ),
-    "two bias sigmas": (
-        lambda: initial_state(IDENTITY, attitude_sigma=1.0, bias_sigma=[1.0, 2.0]),
-        r"bias_sigma has shape \(2,\)",
-    ),
-    "sigma in words": (lambda: initial_state(IDENTITY, attitude_sigma="1°", bias_sigma=1.0), "attitude_sigma is not"),
-    "a bare block": (lambda: StepFilter(NOISE, start(), UNBIASED[0]), "single declaration .*; give a tuple"),
-    "a bare block of a start": (
-        lambda: estimation.with_error_states(start(), UNBIASED[0]),
-        "single declaration .*; give a tuple",
-    ),
-    "a bare series": (lambda: replace(RECORD, vectors=SERIES), r"\(series,\)"),
-    "no series": (lambda: resting(X), r"vectors\[0\] is"),
-    "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
-}
-
-
-FACES = {
-    "estimation.run": estimation.run,
-    "estimation.smooth": estimation.smooth,
-    "StepFilter": lambda record, *given, **options: GatedStepFilter(*given, **options),
-    "estimation.observability": estimation.observability,
-    "multiple_model.run": lambda record, noise, initial, **options: multiple_model.run(record, noise, **options),
-    "filters.run": lambda *given: filters.run("mahony", *given),
-    "filters.compare": filters.compare,
-}
-WRONG_ARGUMENTS = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}
-
-
-def wants(face, name):
-    """Whether a face has an argument of that name."""
-    if name in ("gate", "robust"):
-        return "filters" not in face and face not in ("estimation.observability", "multiple_model.run")
-    return (face, name) not in {("multiple_model.run", "initial"), ("StepFilter", "record")}
-
-
-@pytest.mark.parametrize(
-    ("face", "name"), [(face, name) for face in FACES for name in WRONG_ARGUMENTS if wants(face, name)]
-)
-def test_every_face_refuses_what_is_no_argument(face, name):
-    given = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG_ARGUMENTS[name]}
-    three = [given.pop(one) for one in ("record", "process_noise", "initial")]
-    of_class = {"record": "ImuRecord", "process_noise": "ProcessNoise", "initial": "State", "gate": "Gate"}
-    message = f"^{name} is {WRONG_ARGUMENTS[name]!r}, not of class {of_class.get(name, 'Robust')}; "
-    with pytest.raises(InputError, match=message):
-        FACES[face](*three, **given)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ({"bias_sigma": [1.0, 2.0]}, r"bias_sigma has shape \(2,\); give one number, or three"),
-        ({"bias_sigma": -1.0}, "bias_sigma"),
-        ({"bias": [0.0, 1.0]}, "bias has shape"),
-    ],
-)
-def test_the_bank_names_what_it_cannot_start_with(option, words):
-    with pytest.raises(InputError, match=words):
-        multiple_model.run(RECORD, NOISE, **option)
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_no_argument_is_named(case):
-    make, words = WRONG[case]
-    with pytest.raises(InputError, match=words):
-        make()
-
-
-def test_an_algorithm_goes_by_its_name():
-    record = record_of(1.0)
-    from strapdown import coning
-
-    one = records.compress(record, "two-sample")
-    other = records.compress(record, coning.ALGORITHMS["two-sample"])
-    assert np.array_equal(one.increments, other.increments)

@@ -13,7 +13,7 @@ from measured import series_of
 from scipy.optimize import brentq
 from two_stars import ANGLES, ARW, BELIEVED, FREE, KINDS, RRW, angle_case, case, differences, every_kind, scenario
 
-from strapdown import consistency, gyro, motion, quaternion, scenarios, tuning, units, vectors
+from strapdown import consistency, gyro, motion, quaternion, scenarios, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
@@ -25,7 +25,6 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import ImuRecord
 from strapdown.tuning import fitting, innovations, parameters
-from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
 SENSORS = ("sun.sigma", "up.sigma", "north.sigma", "tracker.sigma")
@@ -609,46 +608,6 @@ def test_the_first_measurements_show_where_it_starts():
     blind = dataclasses.replace(record, vectors=record.vectors[:1], truth=None)
     with pytest.raises(InputError, match="the first measurements do not give the attitude"):
         tuning.record_case(blind, KINDS)
-
-
-# ------------------------------------------------------------------------------------------------------ bad input
-
-
-@pytest.mark.parametrize(
-    ("free", "complaint"),
-    [
-        ([], "no parameter"),
-        (["gyro.awr"], "did you mean 'gyro.arw'"),
-        (["gyro.arw", "gyro.arw"], "twice"),
-        (["star 3.sigma"], "star 1.sigma"),
-        (["filter.scale", "gyro.arw"], "alone"),
-    ],
-)
-def test_bad_names_are_refused(free, complaint):
-    with pytest.raises(InputError, match=complaint):
-        tuning.likelihood([case()], BELIEVED, free)
-
-
-def test_other_bad_input_is_refused():
-    one = case()
-    with pytest.raises(InputError, match="no record"):
-        tuning.likelihood([], BELIEVED, FREE)
-    constant = dataclasses.replace(BELIEVED, process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0))
-    with pytest.raises(InputError, match=r"gyro.rrw starts from 0"):
-        tuning.likelihood([one], constant, FREE)
-    with pytest.raises(InputError, match="no measurement between"):
-        tuning.likelihood([dataclasses.replace(one, first=1e6)], BELIEVED, FREE)
-    with pytest.raises(InputError, match="greater than 1"):
-        tuning.Prior(value=1.0, factor=1.0)
-    with pytest.raises(InputError, match="priors"):
-        tuning.fit(tuning.likelihood([one], BELIEVED, FREE), priors={"gyro.arv": tuning.Prior(value=1.0, factor=2.0)})
-    silent = dataclasses.replace(one.record.vectors[0], sigma=np.zeros(1))
-    record = dataclasses.replace(one.record, vectors=(silent, *one.record.vectors[1:]))
-    with pytest.raises(InputError, match="sigma is 0"):
-        tuning.values_of(BELIEVED, ["star 1.sigma"], [record])
-    assert own_sigma("star 2", [record]) == pytest.approx(2e-4)
-    assert tuning.unit_of("star 1.sigma", [record]).factor == units.ARCSECOND
-    assert fitting.random_starts(np.zeros(2), 3, 30.0, np.random.default_rng(0)).shape == (3, 2)
 
 
 # ------------------------------------------------------------------------------------------------------ figures

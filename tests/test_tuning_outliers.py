@@ -11,7 +11,6 @@ from scipy.stats import chi2, norm
 from two_stars import ANGLES, BELIEVED, FREE, KINDS, TRUTH, WRONG, differences
 
 from strapdown import scenarios, tuning, vectors
-from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
@@ -383,13 +382,6 @@ def test_a_gate_of_the_setup_keeps_what_else_it_says():
     assert found.gate is not None
     assert found.gate.recovery is None
     assert found.gate.probability == found.probability != 0.9
-
-
-def test_bad_input_is_refused():
-    with pytest.raises(InputError, match=r"share of the outliers is 0.6; it must lie between 0.0001 and 0.4"):
-        tuning.contaminated_likelihood([case()], BELIEVED, FREE, share=0.6)
-    with pytest.raises(InputError, match="scale of the outliers is 1"):
-        tuning.contaminated_likelihood([case()], BELIEVED, FREE, scale=1.0)
 
 
 # -------------------------------------------------------------------------------------------------- the command line

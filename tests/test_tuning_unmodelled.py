@@ -9,7 +9,6 @@ from scipy.stats import chi2
 from two_stars import stars
 
 from strapdown import motion, scenarios, tuning, vectors
-from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
 from strapdown.gyro import GyroSpec
@@ -193,26 +192,6 @@ def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     assert found.causes[0].name == "hard iron"
     assert not found.moves_with_the_rate
     assert any("Most likely cause" in words for words in found.words)
-
-
-def test_records_of_one_kind_of_gyro_are_taken():
-    other = dataclasses.replace(SPEC, turn_on_bias_sigma=1e-3, scale_factor=np.full(3, 1e-3))
-    tuning.one_gyro({"a": SPEC, "b": other, "c": dataclasses.replace(SPEC, angle_random_walk=np.full(3, 3e-5))})
-    tuning.one_gyro({})
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"angle_random_walk": 6e-5}, "angle_random_walk is 6e-05 and 3e-05"),
-        ({"rate_random_walk": np.array([2e-7, 2e-7, 3e-7])}, "rate_random_walk is 3e-07 and 2e-07"),
-        ({"bias_instability": 1e-6}, "bias_instability is 1e-06 and 0"),
-        ({"markov_noise": 1e-7, "markov_correlation_time": 100.0}, "markov_noise is 1e-07 and 0"),
-    ],
-)
-def test_records_of_two_kinds_are_refused(change, complaint):
-    with pytest.raises(InputError, match=complaint):
-        tuning.one_gyro({"a.h5": SPEC, "b.h5": dataclasses.replace(SPEC, **change)})
 
 
 def test_the_command_reports_it_and_refuses_two_kinds(succeeds, refusal, tmp_path):

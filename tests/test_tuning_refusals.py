@@ -1,0 +1,95 @@
+"""What tuning refuses: a call, and the argument that is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from measured import FIELD, HAND
+from two_stars import BELIEVED, FREE, case, drawn_case, scenario
+
+from strapdown import covariance, gyro, tuning, vectors
+from strapdown.checks import InputError
+from strapdown.estimation import setup
+from strapdown.estimation.setup.states import SensorStates, States
+from strapdown.estimation.states import ProcessNoise
+
+ONE = case(duration=20.0)
+SILENT = replace(ONE.record.vectors[0], sigma=np.zeros(1))
+SILENT = replace(ONE.record, vectors=(SILENT, *ONE.record.vectors[1:]))
+COMPASS = replace(
+    scenario(5.0),
+    motion=HAND,
+    sensors=(
+        vectors.Magnetometer(name="mag", field_f=FIELD, sigma=5e-7, rate=10.0, kind="heading"),
+        vectors.Accelerometer(name="acc", sigma=0.05, rate=10.0, kind="vector"),
+    ),
+)
+CHOSEN = setup.FilterSetup.for_scenario(COMPASS, states=False)
+HELD = drawn_case(COMPASS, CHOSEN, 1)
+AXES = replace(CHOSEN, sigma={"mag": (0.1, 0.1, 0.1)})
+OF_ANOTHER = replace(CHOSEN, states=States(sensors={"acd": SensorStates(bias_sigma=1.0)}))
+COLOURED = replace(CHOSEN, states=States(sensors={"acc": SensorStates(correlated_sigma=0.4, correlation_time=1.0)}))
+STEADY = replace(BELIEVED, process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=0.0))
+UNSPECIFIED = {"gyro.arv": tuning.Prior(value=1.0, factor=2.0)}
+SPEC = gyro.GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
+
+
+def free(*names, of=ONE, chosen=BELIEVED):
+    return tuning.likelihood([of], chosen, names)
+
+
+def of_compass(*names, chosen=CHOSEN):
+    return free(*names, of=HELD, chosen=chosen)
+
+
+def mixed(**options):
+    return tuning.contaminated_likelihood([ONE], BELIEVED, FREE, **options)
+
+
+def two_gyros(**change):
+    return tuning.one_gyro({"a.h5": SPEC, "b.h5": replace(SPEC, **change)})
+
+
+# fmt: off
+TABLE = [
+    (free, (), {}, "no parameter"),
+    (free, ("gyro.awr",), {}, "did you mean 'gyro.arw'"),
+    (free, ("gyro.arw", "gyro.arw"), {}, "free names gyro.arw twice"),
+    (free, ("star 3.sigma",), {}, "star 1.sigma"),
+    (free, ("filter.scale", "gyro.arw"), {}, "tune it alone"),
+    (free, FREE, {"chosen": STEADY}, "gyro.rrw starts from 0"),
+    (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
+    (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
+    (tuning.values_of, (BELIEVED, ["star 1.sigma"], [SILENT]), {}, "sigma is 0"),
+    (tuning.Prior, (), {"value": 1.0, "factor": 1.0}, "factor of the prior is 1.0; .* greater than 1"),
+    (tuning.fit, (free(*FREE),), {"priors": UNSPECIFIED}, "priors"),
+    (setup.modelled_record, (HELD.record, AXES), {}, "mag is .*three numbers, but a heading has one degree of freedom"),
+    (of_compass, ("mag.sigma.x",), {}, r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"),
+    (of_compass, ("acc.sigma", "acc.sigma.y"), {}, "acc.sigma.y is part of acc.sigma; give that, or the axes"),
+    (of_compass, ("axc.sigma.x",), {}, "did you mean 'acc.sigma.x'"),
+    (of_compass, ("acc.correlated_time",), {"chosen": COLOURED}, "did you mean 'acc.correlation_time'"),
+    (of_compass, ("acd.bias_sigma",), {"chosen": OF_ANOTHER}, "did you mean 'acc'"),
+    (mixed, (), {"share": 0.6}, "share of the outliers is 0.6; it must lie between 0.0001 and 0.4"),
+    (mixed, (), {"scale": 1.0}, "scale of the outliers is 1"),
+    (two_gyros, (), {"angle_random_walk": 6e-5}, "angle_random_walk is 6e-05 and 3e-05"),
+    (two_gyros, (), {"rate_random_walk": np.array([2e-7, 2e-7, 3e-7])}, "rate_random_walk is 3e-07 and 2e-07"),
+    (two_gyros, (), {"bias_instability": 1e-6}, "bias_instability is 1e-06 and 0"),
+    (two_gyros, (), {"markov_noise": 1e-7, "markov_correlation_time": 100.0}, "markov_noise is 1e-07 and 0"),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("call", "given", "options", "named"), TABLE, ids=[row[3] for row in TABLE])
+def test_what_makes_no_sense_is_refused_by_name(call, given, options, named):
+    with pytest.raises(InputError, match=named):
+        call(*given, **options)
+
+
+def test_what_is_near_it_is_taken():
+    assert not any(name.startswith("mag") for name in tuning.parameters.axis_names([HELD.record]))
+    three = replace(CHOSEN, sigma={"acc": (0.05, 0.05, 0.1)})
+    assert covariance.analyse(COMPASS, three, epochs=2).expected_nis["acc"] > 0.0
+    assert tuning.parameters.own_sigma("star 2", [SILENT]) == pytest.approx(2e-4)
+    two_gyros(turn_on_bias_sigma=1e-3, scale_factor=np.full(3, 1e-3))
+    two_gyros(angle_random_walk=np.full(3, 3e-5))
+    tuning.one_gyro({})
