@@ -838,3 +838,14 @@ def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch,
     assert consider.sensor_bias == {"magnetometer": pytest.approx(100e-9)}
     assert options["initial_attitude_sigma"] == pytest.approx(2.0 * DEGREE)
     assert options["initial_bias_sigma"] == pytest.approx(30.0 * DEGREE / 3600.0)
+
+
+def test_a_scenario_without_sensors_is_dead_reckoning():
+    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-7)
+    scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=100.0)
+    found = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
+        angle_random_walk=1e-4, rate_random_walk=1e-7)), epochs=1)  # fmt: skip
+    t = 100.0
+    expected = 2e-3**2 + (2e-5 * t) ** 2 + 1e-8 * t + 1e-14 * t**3 / 3.0
+    assert np.allclose(np.diag(found.covariance[-1])[:3], expected, rtol=1e-9)
+    assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)

@@ -494,3 +494,15 @@ def test_a_campaign_of_lost_starts_with_states_ends_consistent():
     assert np.max(gated.finite) == 12
     assert_inside(gated.anees[-1, 1], 3, 12, 0.9999)
     assert blind.anees[-1, 1] > 100.0
+
+
+@pytest.mark.slow
+def test_a_lever_arm_recovers():
+    one = made("hard iron", 5, duration=6.0)
+    states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})
+    filter_setup = FilterSetup(process_noise=NOISE, bias_sigma=BIAS_SIGMA, states=states, gate=Gate())
+    estimate = setup.run(one.record, filter_setup, lost(one.initial, 5), full_covariance=True)
+    assert len(recoveries(estimate)) == 1
+    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
+    arm = estimate.error_states["acc lever arm"]
+    assert np.all(np.abs(arm.values[-1]) < 4.5 * arm.sigma[-1])

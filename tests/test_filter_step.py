@@ -151,3 +151,54 @@ def test_the_filter_is_off_by_no_more_than_its_docstring_says(x):
         excess = P[axis, axis] / across(x) - 1.0
         assert -1e-6 <= excess <= 1.0 / across(x) - 1.0 + 1e-6
         assert excess <= {0.1: 0.00084, 0.35: 0.0103, 1.0: 0.088, 2.0: 0.413}[x]
+
+
+@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0, 12.0])
+def test_a_reset_of_any_size_is_a_rotation_of_the_covariance(angle):
+    """Either side of where the polynomials give way; A and B against J_r in NumPy, q of norm one."""
+    rng = np.random.default_rng(3)
+    M = rng.standard_normal((6, 6))
+    P = M @ M.T
+    c = angle * np.array([-0.64, 0.6, 0.48])
+    q = quaternion.normalize(rng.standard_normal(4))
+    moved, A, B = filter_step.reset(tuple(q), tuple(P[np.triu_indices(3)]), tuple(P[:3, 3:].ravel()), tuple(c))
+    G = kinematics.right_jacobian(c)
+    assert np.linalg.norm(moved) == pytest.approx(1.0, abs=1e-13 if angle > 1.0 else 1e-9)
+    assert abs(abs(np.dot(moved, quaternion.multiply(q, quaternion.exp(c)))) - 1.0) < 1e-9
+    assert np.allclose(A, (G @ P[:3, :3] @ G.T)[np.triu_indices(3)], rtol=0.0, atol=1e-8)
+    assert np.allclose(np.reshape(B, (3, 3)), G @ P[:3, 3:], rtol=0.0, atol=1e-8)
+
+
+def test_direction_rows_are_the_derivative_of_the_measurement():
+    generator = np.random.default_rng(5)
+    q = quaternion.normalize(generator.normal(size=4))
+    frame = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    frame *= np.linalg.det(frame)
+    u, v, r = frame
+    R = tuple(quaternion.to_matrix(q).ravel())
+    for delta in np.eye(3) * 1e-6:
+        true = quaternion.multiply(q, quaternion.exp(delta))
+        z = quaternion.rotate(quaternion.conjugate(true), r)
+        h1, y1, h2, y2 = filter_step.direction_rows(R, tuple(u), tuple(v), tuple(z))
+        assert y1 == pytest.approx(np.dot(h1, delta), abs=3e-12)
+        assert y2 == pytest.approx(np.dot(h2, delta), abs=3e-12)
+
+
+def test_reset_is_the_change_of_tangent_space():
+    """The new error is Log(exp(−a) ⊗ exp(δ)) for δ about a: its derivative by δ is J_r(a), found here by differences."""
+    generator = np.random.default_rng(6)
+    P = random_state(generator).covariance
+    A, B, C = blocks(P)
+    a = np.array([0.3, -0.2, 0.1])
+    G = np.empty((3, 3))
+    step = 1e-6
+    for j in range(3):
+        shift = np.zeros(3)
+        shift[j] = step
+        plus = quaternion.log(quaternion.multiply(quaternion.exp(-a), quaternion.exp(a + shift)))
+        minus = quaternion.log(quaternion.multiply(quaternion.exp(-a), quaternion.exp(a - shift)))
+        G[:, j] = (plus - minus) / (2.0 * step)
+    big = scipy.linalg.block_diag(G, np.eye(3))
+    q, A, B = filter_step.reset((1.0, 0.0, 0.0, 0.0), A, B, tuple(a))
+    assert np.allclose(matrix(A, B, C), big @ P @ big.T, rtol=0.0, atol=1e-9 * P.max())
+    assert np.allclose(q, quaternion.exp(a), rtol=0.0, atol=1e-15)

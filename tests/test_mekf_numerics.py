@@ -410,3 +410,21 @@ def test_the_smoother_takes_directions_much_sharper_than_its_start(sigma):
         whole = estimation.smooth(record, process, start, full_covariance=True)
         assert np.max(quaternion.angle_between(whole.attitude, truth)) < 1e-6
         assert np.all(whole.variance > 0.0)
+
+
+@pytest.mark.parametrize(("exponent", "gate"), DECADES, ids=NAMES)
+def test_the_covariance_is_that_of_the_information_form(exponent, gate):
+    """(I/σ₀² + Σ (I − r rᵀ)/σ²)⁻¹ of three directions at one time."""
+    sigma = 10.0**exponent
+    references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
+    series = tuple(series_of(f"s{k}", "direction", [0.0], [r], r, sigma) for k, r in enumerate(references))
+    record = resting(*series)
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
+    estimate = taken_or_refused(sigma, record, NOISE, start, gate=gate)
+    if estimate is None:
+        return
+    P = estimate.covariance[0, :3, :3]
+    information = np.eye(3) + sum(np.eye(3) - np.outer(r, r) for r in references) / sigma**2
+    expected = np.linalg.inv(information)
+    d = np.sqrt(np.diag(expected))
+    assert np.abs((P - expected) / np.outer(d, d)).max() < 1e-9

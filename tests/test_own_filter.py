@@ -472,3 +472,15 @@ def test_a_comparison_gives_errors_over_the_bound():
         record = replace(one.record, truth=None) if message == "no truth" else one.record
         with pytest.raises(InputError, match=message):
             filters.compare(record, base.process_noise, one.initial, filters=["mekf"], every=2, bound=bad)
+
+
+def test_the_bound_ends_in_farrenkopfs_steady_state():
+    """Farrenkopf 1978, one axis at rest, just after an update."""
+    su, sv, sn, dt = 1e-6, 1e-5, 1e-4, 1.0
+    S_u, S_v = su * dt**1.5 / sn, sv * dt**0.5 / sn
+    gamma = np.sqrt(1.0 + S_v**2 / 4.0 + S_u**2 / 48.0)
+    zeta = gamma + S_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * S_u + S_v**2 + S_u**2 / 3.0)
+    bound = cramer_rao(star_tracker(), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
+    variances = [sn**2 * (1.0 - zeta**-2)] * 3 + [su * sn / np.sqrt(dt) * (zeta - 1.0 / zeta) - 0.5 * su**2 * dt] * 3
+    np.testing.assert_allclose(np.diag(bound[-1]), variances, rtol=1e-8)
+    np.testing.assert_allclose(np.diag(bound[0]), [1e-6] * 3 + [1e-10] * 3, rtol=1e-12)

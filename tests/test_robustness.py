@@ -611,3 +611,29 @@ def test_robust_smoothing_is_better_and_consistent():
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():
     draw = generator(1, 0, "uniform").uniform(-np.pi, np.pi, 100_000)
     assert np.std(draw) == pytest.approx(gating.UNIFORM_SIGMA, rel=5e-3)
+
+
+def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
+    record = simulate(scenario(duration=2.0), 1)
+    a, b = record.vectors
+    wrong = a.vector_b.copy()
+    wrong[7] = -wrong[7]
+    missing = a.vector_b.copy()
+    missing[7] = np.nan
+    start = started(record, 0)
+    gate = Gate(probability=1.0 - 1e-9)
+    one = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
+    other = estimation.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
+    assert np.array_equal(one.attitude, other.attitude)
+    assert np.array_equal(one.variance, other.variance)
+    assert one.refused == {"a": 1, "b": 0}
+    assert other.skipped == {"a": 1, "b": 0}
+
+
+def test_a_gate_that_refuses_nothing_is_the_plain_filter():
+    record = simulate(scenario(), 1)
+    start = started(record, 0)
+    plain = estimation.run(record, NOISE, start, full_covariance=True)
+    gated = estimation.run(record, NOISE, start, full_covariance=True, gate=Gate(probability=1.0 - 1e-14))
+    assert np.allclose(plain.attitude, gated.attitude, rtol=0.0, atol=1e-13)
+    assert np.allclose(plain.covariance, gated.covariance, rtol=1e-9, atol=1e-20)
