@@ -30,13 +30,12 @@ from strapdown.recordings.formats import (
     estimate_format,
     format_of,
     from_record,
-    is_estimate,
-    is_record,
     not_held,
     read,
     write,
     writers,
 )
+from strapdown.recordings.recordfiles import is_record
 from strapdown.recordings.samples import GyroSamples, read_samples, samples_of
 from strapdown.recordings.trajectories import read_tum, with_reference
 from strapdown.records.recording import FORCE_UNITS, RATE_UNITS, TIME_UNITS, Recording, gaps, increments

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from strapdown.checks import Array, InputError
 from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
-from strapdown.recordings import recordfiles
 from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"
@@ -50,10 +49,6 @@ def read_csv(
     :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     file = Path(path)
-    if recordfiles.is_record(file):
-        raise InputError(
-            f"{file.name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
-        )
     table = Table(file.name, io.StringIO(reading.text(file), newline=""))
     return naming.recording(
         file.name, table.header, table.load, table.clock_ns, units=units, mapping=columns, gyro_alone=gyro_alone

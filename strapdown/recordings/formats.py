@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.recordings import bag_files, recordfiles, telemetry, trajectories
+from strapdown.recordings import bag_files, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord
 from strapdown.records.recording import Recording, with_gyro
@@ -117,7 +117,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="BROAD",
         endings=(".hdf5", ".h5"),
-        recognised=_starts(b"\x89HDF\r\n\x1a\n"),
+        recognised=_starts(b"\x89HDF\r\n\x1a\n", reading.SEAL),
         read="broad:read_broad",
         write="broad:write_broad",
         lacks=("temperature", "clock"),
@@ -349,13 +349,3 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
 def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Return the contents of a recording that the format of a path's extension cannot store."""
     return _by_ending(path, "write").lacks
-
-
-def is_estimate(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is an estimate of this package in HDF5."""
-    return Path(path).is_file() and reading.kind(path) == "strapdown estimate"
-
-
-def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is a simulated record (:mod:`strapdown.recordings.recordfiles`); a folder is not."""
-    return not Path(path).is_dir() and recordfiles.is_record(path)

@@ -115,7 +115,7 @@ def _samples(
             return _read_array(file, sensor, rate, given)
     if rate is not None:
         raise InputError(f"{file.name} states its own rate; drop the option rate")
-    if not file.is_dir() and file.exists() and recordfiles.is_record(file):
+    if recordfiles.is_record(file):
         if given:
             raise InputError(
                 f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"

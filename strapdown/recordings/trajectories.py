@@ -75,14 +75,9 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
 
 def is_tum(head: bytes) -> bool:
     """Return whether a text begins like a TUM trajectory: rows of eight numbers separated by blanks."""
-    lines = [
-        line.split()
-        for line in head.decode("utf-8", "ignore").splitlines()[:-1]
-        if line.strip() and not line.startswith("#")
-    ]
-    if not lines:
-        return False
-    return all(len(line) == 8 and all(map(is_number, line)) for line in lines)
+    whole = head.decode("utf-8", "ignore").rpartition("\n")[0].splitlines()
+    rows = [line.split() for line in whole if line.strip() and not line.startswith("#")]
+    return bool(rows) and all(len(row) == 8 and all(map(is_number, row)) for row in rows)
 
 
 def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int64], Array]:

@@ -84,10 +84,8 @@ def read(
         return recordings.with_axes(table, axes, invert) if axes or invert else table
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
-    kinds = {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
-    kind = ""
-    if file.is_file():
-        kind = "record" if recordfiles.is_record(file) else kinds.get(reading.kind(file), "")
+    kinds = {recordfiles.KIND: "record", "strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
+    kind = kinds.get(reading.kind(file), "")
     if not kind:
         return recordings.read(file, **options)
     if options:
