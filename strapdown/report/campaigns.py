@@ -14,7 +14,8 @@ from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.report import findings, page
+from strapdown.report import page
+from strapdown.results import Table
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -27,10 +28,9 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     judgement = workflows.check(held)
     bound = verdicts.bound_of(held.plan)
     numbers = verdicts.summary(statistics, bound=bound)
+    ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
-    parts = [
-        part for one in verdicts.tables(numbers) for part in (page.paragraph(f"{one.title}:"), *findings.tabled(one))
-    ]
+    parts = [page.paragraph(f"{one.title}:") + "\n" + page.table(one) for one in verdicts.tables(numbers)]
     failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
@@ -38,17 +38,11 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         f"Monte Carlo: {name}",
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
-        findings.verdict(judgement),
+        page.judged(judgement),
         page.section("Key numbers", *parts, *failed),
-        findings.evidence(judgement),
+        page.section("Evidence", page.table(judgement.listing())),
         page.section("Over time", *_over_time(statistics, judgement)),
-        page.section(
-            "At the end",
-            page.figure(
-                lambda: _end(statistics),
-                "σ-coverage by state, and the covariance of the errors and of the filter",
-            ),
-        ),
+        page.section("At the end", page.figure(lambda: _end(statistics), ending)),
         _worst(statistics, path),
         page.section(
             "Provenance",
@@ -143,13 +137,11 @@ def _end(statistics: Statistics) -> Figure:
 
 
 def _worst(statistics: Statistics, path: Path) -> str:
-    rows = [
-        (str(run), page.number(float(score)))
-        for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
-    ]
+    rows = list(zip(statistics.worst_run, statistics.worst_score, strict=True))
+    head = ("run", "maximum NEES of the state (6 degrees of freedom)")
     return page.section(
         "Worst runs",
-        page.table(("run", "maximum NEES of the state (6 degrees of freedom)"), rows, numbers=2),
+        page.table(Table("", head, rows, left=0)),
         page.paragraph("A run can be repeated by its number, bit for bit, with its record and estimate:"),
         page.code(f'run = sd.montecarlo.replay(sd.read("{path.name}").plan, {int(statistics.worst_run[0])})'),
     )

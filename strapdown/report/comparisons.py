@@ -15,6 +15,7 @@ from strapdown.plots.style import AXES
 from strapdown.records import Estimate
 from strapdown.records.recording import interpolated
 from strapdown.report import page
+from strapdown.results import Table
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
 _COLOURS = ("--a", "--b", "--c")
@@ -125,12 +126,12 @@ def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tu
 
 def _numbers(difference: Array, angle: Array, sigmas: tuple[Array, Array], names: tuple[str, str]) -> str:
     unit, size = angle_unit(np.sqrt(np.mean(difference**2, axis=0)))
-    rms = lambda x: page.number(float(np.sqrt(np.mean(x**2)) / size))  # noqa: E731
+    rms = lambda x: np.sqrt(np.mean(x**2)) / size  # noqa: E731
     named = [(axis, difference[:, k], [sigma[:, k] for sigma in sigmas]) for k, axis in enumerate(AXES)]
     named.append(("total", angle, [np.linalg.norm(sigma[:, :3], axis=1) for sigma in sigmas]))
     rows = [
-        (f"{name}, {unit}", rms(value), page.number(float(np.abs(value).max() / size)), *map(rms, spreads))
+        (f"{name}, {unit}", rms(value), np.abs(value).max() / size, *map(rms, spreads))
         for name, value, spreads in named
     ]
     head = ("attitude", "RMS difference", "largest", *(f"σ of {name}" for name in names))
-    return page.table(head, rows, numbers=4)
+    return page.table(Table("", head, rows))

@@ -10,7 +10,7 @@ import numpy as np
 from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.montecarlo import coning_study
-from strapdown.report import findings, page
+from strapdown.report import page
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -36,9 +36,9 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         f"{scenario['runs']} runs of {scenario['duration_s']:g} s, seed {scenario['seed']}",
         page.verdict(answer, reason),
         _drift_chart(drifts),
-        findings.listed(drift_table),
+        page.listed(drift_table),
         *_filter_charts(filters),
-        findings.listed(filter_table),
+        page.listed(filter_table),
         page.stored_figure(path.with_name("errors"), "Errors about the cone's axis with the filter's ±3σ"),
         page.section("Provenance", page.provenance({**scenario, "source": path.name})),
     )

@@ -15,7 +15,7 @@ from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
-from strapdown.report import findings, page
+from strapdown.report import page
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
 _COLOURS = ("--a", "--b", "--c")
@@ -44,10 +44,10 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
         f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
         f"strapdown {attributes.get('version', '')}",
-        findings.verdict(judgement),
-        findings.listed(estimate.listing()),
-        *([] if table is None else [findings.listed(table.listing())]),
-        findings.evidence(judgement),
+        page.judged(judgement),
+        page.listed(estimate.listing()),
+        *([] if table is None else [page.listed(table.listing())]),
+        page.section("Evidence", page.table(judgement.listing())),
         _over_time(estimate, truth, error),
         *[_sensor(name, one) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),

@@ -10,7 +10,7 @@ import numpy as np
 from strapdown.checks import InputError, one_of
 from strapdown.files import reading
 from strapdown.plots.tuning import TALLEST
-from strapdown.report import findings, page
+from strapdown.report import page
 from strapdown.results import Table
 from strapdown.tuning.fitting import VERDICTS
 
@@ -53,7 +53,7 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
         texts += [text for one in tables for row in ([one.title], one.columns, one.notes, *one.rows) for text in row]
         if not all(isinstance(text, str) for text in texts) or not all(isinstance(one.left, int) for one in tables):
             raise TypeError("what is no text")
-        listed = [findings.listed(one) for one in tables]
+        listed = [page.listed(one) for one in tables]
         charts = {}
         if "slices" in content:  # of the command
             charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
