@@ -20,7 +20,7 @@ from strapdown.files import reading
 from strapdown.recordings import bag_files, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord
-from strapdown.records.recording import Recording, with_gyro
+from strapdown.records.recording import Recording, matched, with_gyro
 
 HEAD = 4096
 """Number of bytes at the start of a file from which its format is recognised."""
@@ -222,25 +222,21 @@ def read(
             f"{file.name} is a {found.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
     given = {"units": units or {}, "columns": columns or {}, "topic": topic}
+    needed = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}
     for name, value in given.items():
+        if value and name not in found.options and name in needed:
+            raise InputError(f"{file.name} ({found.name}): {needed[name]}; drop the option")
         if value and name not in found.options:
-            _refuse_option(file, found, name, value)
+            said = found.name if found.name != "BROAD" else "HDF5"
+            raise InputError(
+                f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
+            )
     options: dict[str, Any] = {name: value for name, value in given.items() if name in found.options}
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
     with reading.from_file(file, found.name):
         recording: Recording = _function(found.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
-
-
-def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
-    if name == "units":
-        said = found.name if found.name != "BROAD" else "HDF5"
-        raise InputError(
-            f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
-        )
-    what = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}[name]
-    raise InputError(f"{file.name} ({found.name}): {what}; drop the option")
 
 
 def write(
@@ -324,12 +320,9 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     for series in record.vectors:
         field = {"accelerometer": "specific_force", "magnetometer": "magnetic_field"}.get(series.sensor)
         if field is not None and series.kind == "vector":
-            values = np.full((len(record.increments), 3), np.nan)
-            places = np.searchsorted(record.time[1:], series.time - 1e-9)
-            same = places < len(values)
-            same[same] &= np.abs(record.time[1:][places[same]] - series.time[same]) < 1e-9
-            values[places[same]] = series.vector_b[same]
-            own[field] = values
+            own[field] = np.full((len(record.increments), 3), np.nan)
+            rows, same = matched(record.time[1:], series.time, 1e-9)
+            own[field][rows[same]] = series.vector_b[same]
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
     words = (

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -86,8 +85,23 @@ def read_samples(
     InputError
         If the sensor is missing, its unit is unknown, or its sample intervals are unequal.
     """
-    file = Path(path)
-    samples = _samples(file, one_of("sensor", sensor, SENSORS), rate, dict(units or {}), columns, topic, gaps)
+    file, given = Path(path), dict(units or {})
+    one_of("sensor", sensor, SENSORS)
+    if file.suffix.lower() == ".npy":
+        reading.existing_file(file)
+        with reading.from_file(file):
+            samples = _read_array(file, sensor, rate, given)
+    elif rate is not None:
+        raise InputError(f"{file.name} states its own rate; drop the option rate")
+    elif recordfiles.is_record(file):
+        if given:
+            raise InputError(
+                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
+            )
+        samples = samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
+    else:
+        recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
+        samples = samples_of(recording, sensor, gaps=gaps)
     largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
     if samples.values.shape[1] not in (1, 3):
         raise InputError(
@@ -106,25 +120,6 @@ LARGEST = 1e12
 """Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
 
 
-def _samples(
-    file: Path, sensor: str, rate: float | None, given: dict[str, str], columns: Any, topic: str, gaps: bool
-) -> GyroSamples:
-    if file.suffix.lower() == ".npy":
-        reading.existing_file(file)
-        with reading.from_file(file):
-            return _read_array(file, sensor, rate, given)
-    if rate is not None:
-        raise InputError(f"{file.name} states its own rate; drop the option rate")
-    if recordfiles.is_record(file):
-        if given:
-            raise InputError(
-                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
-            )
-        return samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
-    recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
-    return samples_of(recording, sensor, gaps=gaps)
-
-
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
@@ -133,7 +128,7 @@ def samples_of(
     if isinstance(content, Recording):
         return _of_recording(content, sensor, gaps)
     if sensor == "gyro":
-        interval = sample_interval(Recording(source=source, time=content.time[1:], rate=content.increments))
+        interval = sample_interval(source, content.time[1:])
         temperature = None if content.temperature is None else content.temperature[1:]
         return GyroSamples(
             values=content.increments, sample_interval=interval, kind="increments", temperature=temperature
@@ -167,9 +162,8 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     time, samples = recording.time[known], values[known]
     temperature = None if recording.temperature is None else temperature_at_samples(recording)[known]
     remarks = recording.remarks
-    own = Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3)))
     try:
-        interval = sample_interval(own)
+        interval = sample_interval(recording.source, time)
     except InputError:
         if not gaps:
             raise

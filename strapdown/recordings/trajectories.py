@@ -89,7 +89,8 @@ def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int
     cells = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not cells:
         raise InputError(f"{path.name} has no data rows")
-    rows, stamps = [], []
+    rows: list[list[float]] = []
+    stamps: list[int] = []
     for k, row in enumerate(cells):
         place = f"{path.name}: data row {k + 1}"
         try:
