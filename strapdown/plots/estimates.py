@@ -169,21 +169,9 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
 
 
 def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray | None = None) -> Figure:
-    """Draw the errors of an estimate relative to a reference about the axes of the fixed frame, with the filter's ±3σ.
+    """Draw the errors of an estimate relative to a reference q_fb (n, 4), heading above, the two of the vertical below, with its ±3σ.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Attitude with its covariance, or its variance about the body axes.
-    reference : ndarray (n, 4)
-        Reference q_fb at the times of the estimate; rows of NaN are unknown.
-    movement : ndarray (n,) of bool, optional
-        Samples that are judged, shaded.
-
-    Returns
-    -------
-    Figure
-        Heading error above, the two errors of the vertical below: a rotation vector in the fixed frame, from estimate to reference.
+    They are a rotation vector in the fixed frame, from estimate to reference; ``movement`` (n,) are the samples that are judged, shaded.
     """
     known = np.asarray(np.isfinite(reference).all(axis=1))
     error = np.full((len(known), 3), np.nan)

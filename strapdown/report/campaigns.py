@@ -111,18 +111,9 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
 
 def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
     """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
-    low, high = (np.full(len(time), bound) for bound in bounds)
-    band = (
-        page.Series(label="upper bound", value=high, colour="--faint", band=True),
-        page.Series(label="lower bound", value=low, colour="--faint", band=True),
-    )
-    return page.chart(
-        title,
-        "per degree of freedom",
-        time,
-        (*band, *lines),
-        log=bool(max(np.nanmax(one.value) for one in lines) > 4.0),
-    )
+    band = page.band(*(np.full(len(time), bound) for bound in bounds))
+    log = bool(max(np.nanmax(one.value) for one in lines) > 4.0)
+    return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
 
 
 def _end(statistics: Statistics) -> Figure:

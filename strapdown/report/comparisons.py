@@ -99,13 +99,9 @@ def _differences(
     charts = []
     for k, axis in enumerate(AXES):
         first, second = (3.0 * sigma[:, k] / size for sigma in sigmas)
-        series = (
-            page.Series(label=f"+3σ of {names[0]}", value=first, colour="--faint", band=True),
-            page.Series(label="−3σ", value=-first, colour="--faint", band=True),
-            page.Series(label=f"+3σ of {names[1]}", value=second, colour="--b", dash=True),
-            page.Series(label="−3σ ", value=-second, colour="--b", dash=True),
-            page.Series(label="difference, second minus first", value=difference[:, k] / size, colour="--a"),
-        )
+        series = page.band(-first, first, (f"+3σ of {names[0]}", "−3σ"))
+        series += page.band(-second, second, (f"+3σ of {names[1]}", "−3σ "), colour="--b", dash=True)
+        series.append(page.Series(label="difference, second minus first", value=difference[:, k] / size))
         reach = 1.3 * max(float(np.abs(one[settled]).max()) for one in (first, second, difference[:, k] / size))
         title, label = f"{what} {axis}, difference", f"{what.lower()} {axis}, {unit}"
         charts.append(page.chart(title, label, time, series, reach=reach))

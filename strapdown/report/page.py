@@ -52,6 +52,14 @@ class Series:
     """Whether the line is dashed."""
 
 
+def band(
+    low: Array, high: Array, labels: tuple[str, str] = ("upper bound", "lower bound"), **look: Any
+) -> list[Series]:
+    """Return the series of a band, by default filled, from its limits; ``labels`` are those of the upper and the lower one."""
+    look = look or {"colour": "--faint", "band": True}
+    return [Series(label=label, value=value, **look) for label, value in zip(labels, (high, low), strict=True)]
+
+
 def text(content: Any) -> str:
     """Return text escaped for HTML."""
     return html.escape(str(content))

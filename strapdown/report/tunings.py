@@ -72,14 +72,10 @@ def _over_time(held: dict[str, Any]) -> list[str]:
     for before, after in zip(*(held[name].get("over_time", []) for name in ("before", "after")), strict=True):
         time, (low, high) = np.array(after["time_s"]), after["bounds"]
         means = [np.array(one["mean"], float) for one in (before, after)]
-        series = [
-            page.Series(
-                label="99 % bounds, each interval", value=np.full(len(time), high), colour="--faint", band=True
-            ),
-            page.Series(label="lower bound", value=np.full(len(time), low), colour="--faint", band=True),
-            page.Series(label="before", value=means[0], colour="--b", dash=True),
-            page.Series(label="after", value=means[1]),
-        ]
+        bounds = (np.full(len(time), low), np.full(len(time), high))
+        series = page.band(*bounds, ("99 % bounds, each interval", "lower bound"))
+        series.append(page.Series(label="before", value=means[0], colour="--b", dash=True))
+        series.append(page.Series(label="after", value=means[1]))
         wide = np.nanmax(means) > 5.0 or np.nanmin(means) < 0.2
         charts.append(page.chart(after["of"], "mean over the interval", time, series, log=bool(wide)))
     return charts
@@ -103,8 +99,7 @@ def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
     line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
     within = (x >= low) & (x <= high)
     series = [
-        page.Series(label="95 % interval", value=np.where(within, TALLEST, np.nan), colour="--faint", band=True),
-        page.Series(label="its lower limit", value=np.where(within, 0.0, np.nan), colour="--faint", band=True),
+        *page.band(*(np.where(within, end, np.nan) for end in (0.0, TALLEST)), ("95 % interval", "its lower limit")),
         page.Series(label="−2 Δ log likelihood", value=np.where(fallen <= TALLEST, fallen, np.nan)),
         page.Series(label="tuned", value=line(value), colour="--c"),
         page.Series(label="before", value=line(before), colour="--b", dash=True),
