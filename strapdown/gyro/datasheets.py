@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.checks import InputError, known_keys, one_of
 from strapdown.files import reading
 from strapdown.gyro.model import GyroSpec, from_table
 
@@ -116,20 +116,9 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     for name, text in quantities.items():
         field, wanted, example = _QUANTITIES[name]
         number = parse(name, text, wanted, example)
-        values[field] = _shaped(name, number)
+        shapes = {"misalignment": 1.0 - np.eye(3), "g_sensitivity": np.eye(3)}
+        values[field] = number / np.sqrt(12.0) if name == "angle_resolution" else number * shapes.get(name, 1.0)
     return GyroSpec(**values)
-
-
-def _shaped(name: str, number: float) -> float | Array:
-    if name == "angle_resolution":
-        return float(number / np.sqrt(12.0))
-    if name in ("scale_factor", "asymmetry"):
-        return np.full(3, number)
-    if name == "misalignment":
-        return number * (1.0 - np.eye(3))
-    if name == "g_sensitivity":
-        return number * np.eye(3)
-    return number
 
 
 @dataclass(frozen=True, eq=False)

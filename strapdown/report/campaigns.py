@@ -111,7 +111,7 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
 
 def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
     """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
-    band = page.band(*(np.full(len(time), bound) for bound in bounds))
+    band = page.band(np.full(len(time), bounds[0]), np.full(len(time), bounds[1]))
     log = bool(max(np.nanmax(one.value) for one in lines) > 4.0)
     return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
 

@@ -99,7 +99,9 @@ def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
     line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
     within = (x >= low) & (x <= high)
     series = [
-        *page.band(*(np.where(within, end, np.nan) for end in (0.0, TALLEST)), ("95 % interval", "its lower limit")),
+        *page.band(
+            np.where(within, 0.0, np.nan), np.where(within, TALLEST, np.nan), ("95 % interval", "its lower limit")
+        ),
         page.Series(label="−2 Δ log likelihood", value=np.where(fallen <= TALLEST, fallen, np.nan)),
         page.Series(label="tuned", value=line(value), colour="--c"),
         page.Series(label="before", value=line(before), colour="--b", dash=True),
