@@ -193,17 +193,12 @@ def exp(rotation_vector: ArrayLike) -> Array:
     Parameters
     ----------
     rotation_vector : array_like (..., 3)
-        φ, rad, of any length.
+        φ, rad, of any length, each component at most 1e150.
 
     Returns
     -------
     ndarray (..., 4)
         Unit quaternions.
-
-    Raises
-    ------
-    InputError
-        If a component exceeds 1e150 rad.
 
     Examples
     --------
@@ -284,11 +279,6 @@ def from_matrix(matrix: ArrayLike) -> Array:
     -------
     ndarray (..., 4)
         Unit quaternions q_fb, w ≥ 0.
-
-    Raises
-    ------
-    InputError
-        If a matrix is not orthogonal or is a reflection.
 
     Notes
     -----

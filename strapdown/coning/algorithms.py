@@ -99,10 +99,6 @@ class Algorithm:
             checks.count(f"{self.name}: {what}", getattr(self, what), minimum=0)
         if self.rate_points % 2:
             raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
-        self._check_window()
-        self._check_tables()
-
-    def _check_window(self) -> None:
         if self.solver == "compressed" and self.following:
             raise InputError(
                 f"{self.name}: following is {self.following}, but the compressed solver uses no increments after the step; "
@@ -112,8 +108,6 @@ class Algorithm:
             raise InputError(
                 f"{self.name}: solver {self.solver!r} uses only the increments of the step; previous and following must be 0"
             )
-
-    def _check_tables(self) -> None:
         m = self.window
         own = _TABLES.get(self.solver)
         for what in _TABLES.values():
@@ -302,11 +296,6 @@ class Algorithm:
         -------
         dict
             Table; exists for rotation-vector algorithms only.
-
-        Raises
-        ------
-        InputError
-            If the solver has no table.
         """
         table: dict[str, Any] = {"name": self.name, "samples": self.samples}
         if self.previous:

@@ -467,11 +467,6 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
     dict
         ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s, the maximum over the axes.
 
-    Raises
-    ------
-    InputError
-        If the gyro has flicker and no bandwidth is given.
-
     Notes
     -----
     Without flicker these are the coefficients of the gyro; a Gauss–Markov bias is represented by its driving noise, which is valid for

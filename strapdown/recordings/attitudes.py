@@ -257,7 +257,12 @@ def _table(path: Path) -> Attitudes:
         covariance = covariance[:, :3, :3]
     if covariance is not None and covariance.shape[1] == 3:
         bias = None  # its covariance is not given
-    _need_order(path.name, stamps[known])
+    back = np.diff(stamps[known]) <= 0
+    if back.any():
+        row = int(np.argmax(back)) + 2
+        raise InputError(
+            f"{path.name}: row {row} is not after the one before; sort the rows, or check the unit of time"
+        )
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[known],
@@ -303,14 +308,6 @@ def _unit(name: str, q: Array) -> Array:
     if bad.any():
         raise InputError(f"{name}: quaternion {int(np.argmax(bad)) + 1} has norm {length[np.argmax(bad)]:.4g}, not 1")
     return quaternion.normalize(q)
-
-
-def _need_order(name: str, stamps: NDArray[np.int64]) -> None:
-    back = np.diff(stamps) <= 0
-    if back.any():
-        raise InputError(
-            f"{name}: row {int(np.argmax(back)) + 2} is not after the one before; sort the rows, or check the unit of time"
-        )
 
 
 # -------------------------------------------------------------------------------------------------------------- bags

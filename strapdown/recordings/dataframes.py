@@ -53,11 +53,6 @@ def from_table(
     Recording
         The recording.
 
-    Raises
-    ------
-    InputError
-        In the same cases as :func:`read` for a CSV file.
-
     Examples
     --------
     >>> import numpy as np

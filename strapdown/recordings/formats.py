@@ -259,11 +259,6 @@ def write(
         it).
     **options : dict
         Options of the format's writer.
-
-    Raises
-    ------
-    InputError
-        If no format of that extension can store such content, or the content lacks data that the format needs.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")

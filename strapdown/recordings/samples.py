@@ -79,11 +79,6 @@ def read_samples(
     -------
     GyroSamples
         Samples at equal intervals.
-
-    Raises
-    ------
-    InputError
-        If the sensor is missing, its unit is unknown, or its sample intervals are unequal.
     """
     file, given = Path(path), dict(units or {})
     one_of("sensor", sensor, SENSORS)

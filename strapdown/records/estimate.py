@@ -465,11 +465,6 @@ class Estimate(ByValue, Listed):
             ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
             ``free_acceleration_*_m_per_s2``. If full covariances were stored, ``cov_body_xx_rad2`` … of the body-side error,
             with ``b`` before an axis for the bias.
-
-        Raises
-        ------
-        InputError
-            If a time of the estimate is not a stamp of the recording.
         """
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance

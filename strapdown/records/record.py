@@ -214,11 +214,6 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
     ImuRecord
         Record of n // N intervals; remaining intervals at the end are dropped.
 
-    Raises
-    ------
-    InputError
-        If the record has fewer than N intervals.
-
     Notes
     -----
     The rotation vector is the increment of the longer interval: with the coning correction, a filter may treat it as a rotation at

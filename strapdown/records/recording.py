@@ -185,11 +185,6 @@ class Recording(Listed):
         -------
         ndarray (m,) of int
             Rows.
-
-        Raises
-        ------
-        InputError
-            If a time is not a stamp of the recording.
         """
         rows, same = matched(self.time, time, 1e-6)
         if not same.all():

@@ -49,6 +49,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
             page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
         ),
     )
+    estimated = len(_estimated(statistics))
     table = {
         "source": path.name,
         "judgement": judgement.summary(),
@@ -56,9 +57,13 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         "failed_runs": statistics.failed,
         "time_s": statistics.time,
         "anees": {name: statistics.anees[:, SUBSETS[name][0]] for name in statistics.subsets},
-        "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))],
-        "sigma_si": statistics.sigma[:, : len(_estimated(statistics))],
-        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _over_bound(statistics, bound)}),
+        "rms_error_si": statistics.rms_error[:, :estimated],
+        "sigma_si": statistics.sigma[:, :estimated],
+        **(
+            {}
+            if bound is None
+            else {"rms_over_root_cramer_rao_bound": verdicts.efficiency(statistics, bound)[:, :estimated]}
+        ),
         "nis_by_sensor": dict(zip(statistics.sensors, statistics.sensor_nis, strict=True)),
         "worst_runs": statistics.worst_run,
     }
@@ -68,11 +73,6 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
 def _estimated(statistics: Statistics) -> tuple[str, ...]:
     """Return the names of the states that the filter estimates."""
     return STATES if statistics.has_bias else STATES[:3]
-
-
-def _over_bound(statistics: Statistics, bound: Array) -> Array:
-    """Return the RMS error divided by the root of the Cramér–Rao bound, by epoch and estimated state."""
-    return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
 
 
 def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:

@@ -67,11 +67,8 @@ def text(content: Any) -> str:
 
 def section(title: str, *parts: str) -> str:
     """Return a section with a heading."""
-    return f'<section id="{_anchor(title)}"><h2>{text(title)}</h2>\n' + "\n".join(parts) + "</section>\n"
-
-
-def _anchor(title: str) -> str:
-    return re.sub(r"\W+", "-", title.lower()).strip("-")
+    anchor = re.sub(r"\W+", "-", title.lower()).strip("-")
+    return f'<section id="{anchor}"><h2>{text(title)}</h2>\n' + "\n".join(parts) + "</section>\n"
 
 
 def _contents(parts: Sequence[str]) -> str:
