@@ -14,7 +14,6 @@ SQLite have none: one changed bit of a sample is another sample.
 - ``telemetry``: Logs of cameras, flight controllers and phones.
 - ``trajectories``: Folders of EuRoC and TUM-VI, TUM trajectories as references.
 - ``broad``: BROAD HDF5.
-- ``estimates``: Estimates in files of all these kinds.
 - ``samples``: One sensor at rest, for the identification of its noise.
 """
 

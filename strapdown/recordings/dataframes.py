@@ -19,7 +19,8 @@ from strapdown.checks import Array, InputError, numbers
 from strapdown.files import atomic_write, reading
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
-from strapdown.recordings.delimited import recording_columns
+from strapdown.recordings.delimited import recording_columns, write_columns
+from strapdown.records import Estimate
 from strapdown.records.recording import CLOCK_OFFSET, Recording, relative_time
 
 
@@ -223,3 +224,11 @@ def write_parquet_columns(
     with atomic_write(path) as temporary:
         table = arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
         parquet.write_table(table, temporary, write_page_checksum=True)
+
+
+def write_estimate(
+    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
+) -> None:
+    """Write an estimate as Parquet or text, by the suffix; options as for :meth:`strapdown.records.Estimate.table`."""
+    write = write_parquet_columns if Path(path).suffix.lower() == ".parquet" else write_columns
+    write(path, estimate.table(recording=recording, **options))

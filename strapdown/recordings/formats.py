@@ -92,7 +92,7 @@ FORMATS: tuple[Format, ...] = (
         read="dataframes:read_parquet",
         options=("units", "columns", "gyro_alone"),
         write="dataframes:write_parquet",
-        write_estimate="estimates:write_table",
+        write_estimate="dataframes:write_estimate",
         estimate_options=("sequence", "frame"),
     ),
     Format(
@@ -111,7 +111,7 @@ FORMATS: tuple[Format, ...] = (
         name="TUM trajectory",
         endings=(".tum",),
         recognised=lambda path, head: _text(head) and trajectories.is_tum(head),
-        write_estimate="estimates:write_tum",
+        write_estimate="trajectories:write_tum",
         estimate_options=("frame",),
     ),
     Format(
@@ -129,7 +129,7 @@ FORMATS: tuple[Format, ...] = (
         read="delimited:read_csv",
         options=("units", "columns", "gyro_alone"),
         write="delimited:write_csv",
-        write_estimate="estimates:write_table",
+        write_estimate="dataframes:write_estimate",
         estimate_options=("sequence", "frame"),
     ),
 )

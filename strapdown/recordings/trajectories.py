@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError
-from strapdown.files import reading
+from strapdown.files import atomic_write, reading
 from strapdown.recordings.delimited import is_number, read_csv
+from strapdown.records import Estimate
 from strapdown.records.recording import Recording, interpolated
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
@@ -126,3 +127,17 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
         )
     words = f"Reference of {name}: at {known} of {len(found)} stamps."
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
+
+
+def write_tum(
+    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, frame: str = "ENU"
+) -> None:
+    """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
+    found = estimate.table(frame=frame)
+    q = np.stack([found[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
+    stamps = np.rint(estimate.time * 1e9).astype(np.int64) + (0 if recording is None else recording.epoch_ns)
+    with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write("# time tx ty tz qx qy qz qw\n")
+        for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
+            sign, size = "-" if stamp < 0 else "", abs(stamp)
+            file.write(f"{sign}{size // 10**9}.{size % 10**9:09d} 0 0 0 {' '.join(map(repr, row))}\n")
