@@ -6,6 +6,7 @@ import pytest
 from measured import series_of
 from typer.testing import CliRunner
 
+import strapdown
 from strapdown import estimation, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
@@ -185,6 +186,7 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     path = csv("time,gx [rad/s],gy,gz,ax,ay,az")
     refused(path, "unit of its accelerometer")
     alone = read(path, gyro_alone=True)
+    np.testing.assert_array_equal(strapdown.read(path, gyro_alone=True).rate, alone.rate)
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
     assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)

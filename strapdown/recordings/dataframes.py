@@ -34,32 +34,7 @@ def from_table(
 ) -> Recording:
     """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
-    Parameters
-    ----------
-    table : DataFrame, Table, Dataset, structured array or mapping of str to array_like
-        Columns named as those of a CSV file, of pandas, polars, pyarrow or another library with ``__arrow_c_stream__``; arrays (n, 3) of a
-        mapping, a structured array or a Dataset hold x, y and z.
-    source : str, default "table"
-        Name of the recording, for messages.
-    units : mapping of str to str, optional
-        Units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
-    columns : mapping of str to str, optional
-        Names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are found by
-        their names.
-    gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units are then not needed.
-
-    Returns
-    -------
-    Recording
-        The recording.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> rest = {"time": np.arange(3.0), "gyro [dps]": np.zeros((3, 3))}
-    >>> from_table(rest).rate.shape
-    (3, 3)
+    ``source`` is its name in messages; options as for :func:`strapdown.read`.
     """
     found = _columns(source, table)
     names, arrays = list(found), list(found.values())
@@ -177,7 +152,7 @@ def read_parquet(
     columns: Mapping[str, str] | None = None,
     gyro_alone: bool = False,
 ) -> Recording:
-    """Read a recording from Parquet; options as for :func:`strapdown.recordings.read`."""
+    """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     reading.existing_file(file)

@@ -46,7 +46,7 @@ def read_csv(
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
     left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
-    :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors are not needed.
+    :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     file = Path(path)
     table = Table(file.name, io.StringIO(reading.text(file), newline=""))

@@ -180,41 +180,7 @@ def read(
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
 ) -> Recording:
-    """Read a recording of any format, recognised by its content.
-
-    Parameters
-    ----------
-    path : path-like
-        A file, or the folder of a ROS 2 bag or of EuRoC.
-    units : mapping of str to str, optional
-        For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
-    gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units are then not needed.
-    columns : mapping of str to str, optional
-        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
-        are found by their names.
-    topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, if there are several.
-    axes : str or mapping of str to str, optional
-        The recorded axes that become the body's x, y, z, for example ``"x,-y,-z"`` for a unit whose z axis points down; or those of
-        single sensors, ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
-    invert : str or iterable of str, default empty
-        Sensors with inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
-
-    Returns
-    -------
-    Recording
-        The recording; its ``remarks`` list the choices of the reader.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, of no known format, truncated before the first complete sample, or its units are unknown or undeclared.
-
-    Examples
-    --------
-    >>> walk = read("walk.csv", units={"gyro": "deg/s"})  # doctest: +SKIP
-    """
+    """Read a recording of any format, recognised by its content: a file, or a folder; options as for :func:`strapdown.read`."""
     file = Path(path)
     found = format_of(file)
     if not found.read:
@@ -248,17 +214,8 @@ def write(
 ) -> None:
     """Write a recording or an estimate in the format of the file extension; the file is created only when complete.
 
-    Parameters
-    ----------
-    content : Recording, ImuRecord or Estimate
-        Data to write. A simulated record is written as the recording of a device.
-    path : path-like
-        File: ``.csv``, ``.tsv``, ``.parquet``, ``.h5``, ``.bag``, ``.mcap`` …
-    recording : Recording, optional
-        With an estimate: the recording that it was made from, whose samples are written if the format supports them (a ROS bag needs
-        it).
-    **options : dict
-        Options of the format's writer.
+    A simulated record is written as the recording of a device. ``recording`` is that from which an estimate was made, whose samples are
+    written if the format supports them (a ROS bag needs it); ``options`` are those of the format's writer.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")

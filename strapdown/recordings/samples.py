@@ -57,28 +57,8 @@ def read_samples(
 ) -> GyroSamples:
     """Read one sensor of a recording of any format, the gyro of a simulated record, or a NPY array (n,) or (n, 3).
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor.
-    rate : float, optional
-        Sample rate, Hz; only for an NPY array.
-    units : mapping of str to str, optional
-        Units as in :func:`strapdown.recordings.read`; for an NPY array by the name of the sensor.
-    columns : mapping of str to str, optional
-        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
-        are found by their names.
-    topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, if there are several.
-    gaps : bool, default False
-        Whether gaps are allowed: samples are then placed on a grid, and missing ones are NaN.
-
-    Returns
-    -------
-    GyroSamples
-        Samples at equal intervals.
+    ``rate``, Hz, is only for an array, whose unit is ``units[sensor]``; other options as for :func:`strapdown.read`. ``gaps``: whether gaps
+    are allowed: samples are then placed on a grid, and missing ones are NaN.
     """
     file, given = Path(path), dict(units or {})
     one_of("sensor", sensor, SENSORS)
