@@ -15,14 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import InputError, known_keys, one_of
+from strapdown.checks import InputError, known_keys
 from strapdown.files import reading
 from strapdown.gyro.model import GyroSpec, from_table
 
 __all__ = [
     "PRESETS",
     "from_datasheet",
-    "preset",
 ]
 
 _QUANTITIES = {
@@ -151,24 +150,3 @@ PRESETS = {
     name: Preset(name=name, **table) for name, table in reading.toml(Path(__file__).with_name("presets.toml")).items()
 }
 """Presets by name, from consumer MEMS to navigation grade."""
-
-
-def preset(name: str) -> Preset:
-    """Return a preset by name.
-
-    Parameters
-    ----------
-    name : str
-        Key of :data:`PRESETS`.
-
-    Returns
-    -------
-    Preset
-        The preset.
-
-    Examples
-    --------
-    >>> preset("stim300").grade
-    'tactical MEMS'
-    """
-    return PRESETS[one_of("preset", name, PRESETS)]
