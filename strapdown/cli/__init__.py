@@ -32,11 +32,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
         "scenarios": ("sensors",),
         "keys": ("sensors", "sensors", "coning"),
         "simulate": ("sensors", "two-stars", "satellite.toml --seed 2 --out flight.h5"),
-        "estimate": (
-            "estimation",
-            "two-stars.h5",
-            "walk.csv --gyro-unit deg/s --accelerometer-unit g --to angles.csv",
-        ),
+        "estimate": ("estimation", "two-stars.h5", "walk.csv --gyro-unit deg/s --accelerometer-unit g --to angles.csv"),
         "check": ("judgement", "estimate-results/estimate.h5", "other.csv --truth flight.h5"),
         "report": ("judgement", "estimate-results/estimate.h5"),
         "montecarlo": ("campaigns", "satellite.toml --runs 400", "satellite.toml --filter mine.py:run"),

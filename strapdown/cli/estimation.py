@@ -132,8 +132,7 @@ class _Output:
 
     out: Path = Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
     to: list[Path] | None = Option(
-        None,
-        help="Also write this file: .csv, .tsv, .parquet, .tum; of a recording .bag, .mcap, .db3; repeatable.",
+        None, help="Also write this file: .csv, .tsv, .parquet, .tum; of a recording .bag, .mcap, .db3; repeatable."
     )
     euler: str | None = Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = Option(None, help="With --to: fixed frame, enu (default) or ned; body axes are not changed.")

@@ -19,10 +19,7 @@ from strapdown.checks import InputError, known_keys
 from strapdown.files import reading
 from strapdown.gyro.model import GyroSpec, from_table
 
-__all__ = [
-    "PRESETS",
-    "from_datasheet",
-]
+__all__ = ["PRESETS", "from_datasheet"]
 
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),

@@ -90,10 +90,7 @@ def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
 
 
 def _course(
-    ax: Axes,
-    courses: Sequence[tuple[str, str, float, Array, Array]],
-    bounds: tuple[float, float],
-    label: str,
+    ax: Axes, courses: Sequence[tuple[str, str, float, Array, Array]], bounds: tuple[float, float], label: str
 ) -> None:
     """Draw means over intervals of time, whose expectation is 1 for a consistent filter, before and after tuning."""
     for name, color, mean, time, values in courses:

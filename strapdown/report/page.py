@@ -240,11 +240,7 @@ def packed_time(time: Array) -> dict[str, Any]:
     least = float(intervals[intervals > 0.0].min(initial=1.0))
     tick = max(min(1e-6, 1e-3 * least), float(intervals.max(initial=0.0)) / 2.0**30)
     ticks = np.rint((time - time[0]) / tick).astype(np.int64)
-    return {
-        "first": float(time[0]),
-        "tick": tick,
-        "deflate": _compressed(np.diff(ticks, prepend=0).astype(np.int32)),
-    }
+    return {"first": float(time[0]), "tick": tick, "deflate": _compressed(np.diff(ticks, prepend=0).astype(np.int32))}
 
 
 def _compressed(integers: NDArray[Any]) -> str:

@@ -108,13 +108,7 @@ class VectorMeasurements:
 
     @classmethod
     def from_headings(
-        cls,
-        sensor: str,
-        time: ArrayLike,
-        heading: ArrayLike,
-        sigma: ArrayLike,
-        *,
-        axis_b: ArrayLike = (1.0, 0.0, 0.0),
+        cls, sensor: str, time: ArrayLike, heading: ArrayLike, sigma: ArrayLike, *, axis_b: ArrayLike = (1.0, 0.0, 0.0)
     ) -> VectorMeasurements:
         """Return measured headings of a body axis, such as those of a two-antenna receiver or a gyrocompass.
 

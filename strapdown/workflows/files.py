@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strapdown import (
-    recordings,
-    scenarios,
-)
+from strapdown import recordings, scenarios
 from strapdown.checks import Hint, InputError, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strapdown import (
-    consistency,
-)
+from strapdown import consistency
 from strapdown.checks import Hint, InputError, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
