@@ -10,13 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.montecarlo.coning_study import PROBABILITY, ConingStudy, Drift, FilterOutcome
+from strapdown.montecarlo.coning_study import PROBABILITY, ROUNDING, ConingStudy, Drift, FilterOutcome
 from strapdown.plots import style
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
-
-_ROUNDING = 1e-6  # °/h: smaller drifts are rounding errors of the simulation
 
 
 def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
@@ -25,21 +23,21 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     places = np.arange(len(drifts))
     measured = np.array([abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts])
     predicted = np.array([abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts])
-    shown = [x for x in (*measured, *predicted) if x > _ROUNDING]
-    low, high = min(shown, default=_ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
+    shown = [x for x in (*measured, *predicted) if x > ROUNDING]
+    low, high = min(shown, default=ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
     ax.set_yscale("log")
     ax.set(xlim=(-0.6, len(drifts) - 0.4), ylim=(low, high))
     ax.bar(
         places,
-        np.where(measured > _ROUNDING, measured, np.nan),
+        np.where(measured > ROUNDING, measured, np.nan),
         width=0.55,
         color=style.SKY,
         label="measured relative to the closed form",
     )
-    lines = np.where(predicted > _ROUNDING, predicted, np.nan)
+    lines = np.where(predicted > ROUNDING, predicted, np.nan)
     ax.hlines(lines, places - 0.36, places + 0.36, color=style.ink(), linewidth=2, label="predicted by the formula")
     for place, value, line in zip(places, measured, lines, strict=True):
-        text = f"{value:.3g}" if value > _ROUNDING else "rounding"
+        text = f"{value:.3g}" if value > ROUNDING else "rounding"
         top = max(value, np.nan_to_num(line), low)
         ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_xticks(places, [drift.algorithm.replace("-", "-\n", 1) for drift in drifts])

@@ -73,9 +73,10 @@ class Table:
             if len(row) == width + 1 and not row[-1].strip():
                 del row[-1]  # a separator at the end of the line
             if len(row) != width:
-                raise InputError(
-                    f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {_why(row, width)}"
-                )
+                numbers = width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row)
+                why = "the file is truncated or damaged there"
+                why = "it seems to have decimal commas: write points" if numbers else why
+                raise InputError(f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {why}")
             try:
                 result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
             except ValueError:
@@ -195,12 +196,6 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _why(row: Sequence[str], width: int) -> str:
-    if width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row):
-        return "it seems to have decimal commas: write points"
-    return "the file is truncated or damaged there"
 
 
 def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:

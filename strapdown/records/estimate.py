@@ -475,7 +475,9 @@ class Estimate(ByValue, Listed):
         found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         assert angles.sigma is not None
-        for k, name in enumerate(_angle_names(sequence)):
+        axes = sequence.upper()
+        for k, axis in enumerate(axes):
+            name = _NAMES[axis] if len(set(axes)) == 3 else f"angle_{k + 1}_{axis.lower()}"
             found[f"{name}_deg"] = angles.angles[:, k] / DEGREE
             found[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
         north = outputs.heading(self.attitude, P)
@@ -523,12 +525,3 @@ class Estimate(ByValue, Listed):
 _NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 """Names of the angles of a sequence of three different axes."""
 _STATES = ("x", "y", "z", "bx", "by", "bz")
-
-
-def _angle_names(sequence: str) -> list[str]:
-    axes = sequence.upper()
-    return (
-        [_NAMES[axis] for axis in axes]
-        if len(set(axes)) == 3
-        else [f"angle_{k + 1}_{axis.lower()}" for k, axis in enumerate(axes)]
-    )
