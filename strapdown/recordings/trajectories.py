@@ -100,12 +100,12 @@ def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int
             raise InputError(f"{place} is not numeric: {' '.join(row)[:60]!r}") from None
         if len(row) != len(cells[0]):
             raise InputError(f"{place} has {len(row)} fields, the first {len(cells[0])}; the file is truncated there")
-        stamp = Decimal(row[0]) * tick
-        if not stamp.is_finite() or abs(stamp) >= 2**63:
+        stamp = Decimal(row[0])
+        if not stamp.is_finite() or abs(stamp) >= 2**63 // tick:
             raise InputError(f"{place}: the time is {row[0]}, which no clock counts; remove the row")
-        if stamps and int(stamp) <= stamps[-1]:
+        stamps.append(int(stamp * tick))
+        if k and stamps[-1] <= stamps[-2]:
             raise InputError(f"{place} is not after the one before; sort the rows")
-        stamps.append(int(stamp))
     return np.array(stamps, np.int64), np.array(rows)
 
 
