@@ -266,15 +266,17 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     interval. Series of kind "vector" named accelerometer and magnetometer are included, at the stamps where they have samples; the truth is
     the reference.
     """
-    steps = record.intervals[:, None]
     own: dict[str, Any] = {}
     left_out = []
+    simulated = record.origin is not None and record.origin.scenario is not None
     for series in record.vectors:
         field = {"accelerometer": "specific_force", "magnetometer": "magnetic_field"}.get(series.sensor)
         if field is not None and series.kind == "vector":
             own[field] = np.full((len(record.increments), 3), np.nan)
             rows, same = matched(record.time[1:], series.time, 1e-9)
             own[field][rows[same]] = series.vector_b[same]
+            if simulated and field == "magnetic_field":
+                own["magnetic_unit"] = "T"
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
     words = (
@@ -283,7 +285,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     return with_gyro(
         source=source,
         time=record.time[1:],
-        rate=record.increments / steps,
+        rate=record.rates,
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
         temperature=None if record.temperature is None else record.temperature[1:],
         remarks=(words,) if left_out else (),
