@@ -22,6 +22,7 @@ from strapdown.checks import (
     symmetric,
     unit_quaternions,
 )
+from strapdown.files.extras import library
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
@@ -515,11 +516,7 @@ class Estimate(ByValue, Listed):
         pandas.DataFrame
             One row per time.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise InputError("a DataFrame needs pandas; pip install 'strapdown[formats]'") from None
-        return pandas.DataFrame(self.table(**options))
+        return library("pandas", "a DataFrame").DataFrame(self.table(**options))
 
 
 _NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}

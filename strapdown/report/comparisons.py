@@ -18,8 +18,6 @@ from strapdown.report import page
 from strapdown.results import Table
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
-_COLOURS = ("--a", "--b", "--c")
-
 
 def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for two estimate files; the second is interpolated at the times of the first."""
@@ -82,7 +80,7 @@ def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str],
             "angle, °",
             time,
             [
-                page.Series(label=name, value=angles[:, k], colour=_COLOURS[j], wraps=True, dash=j == 1)
+                page.Series(label=name, value=angles[:, k], colour=page.COLOURS[j], wraps=True, dash=j == 1)
                 for j, (name, angles) in enumerate(zip(names, euler, strict=True))
             ],
         )
@@ -114,7 +112,7 @@ def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tu
     for error, attitude in zip(errors, attitudes, strict=True):
         error[known] = quaternion.angle_between(attitude[known], truth[known]) / DEGREE
     series = [
-        page.Series(label=name, value=error, colour=_COLOURS[j], dash=j == 1)
+        page.Series(label=name, value=error, colour=page.COLOURS[j], dash=j == 1)
         for j, (name, error) in enumerate(zip(names, errors, strict=True))
     ]
     return [page.chart("Total attitude error relative to the truth", "error, °", time, series)]

@@ -18,8 +18,6 @@ from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import page
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
-_COLOURS = ("--a", "--b", "--c")
-
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
@@ -85,19 +83,21 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
                 state = states.start + k
                 bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
                 series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) if known else []
-                series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]))
+                series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=page.COLOURS[k]))
                 reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = [
-            page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
+            page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
             for k, name in enumerate(angle_labels(estimate.fixed_frame))
         ]
         charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
-        series = [page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)]
+        series = [
+            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
+        ]
         charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
         series = [page.Series(label="σ, root sum square of the three axes", value=spread)]

@@ -35,6 +35,10 @@ _WIDE = 7.0
 """Width in inches above which a figure scrolls on a narrow page instead of shrinking."""
 
 
+COLOURS = ("--a", "--b", "--c")
+"""Colours of the lines of three axes or of several results, by their names in page.css."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Series:
     """One line of a chart."""
