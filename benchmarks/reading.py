@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from strapdown import read, write
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
-from strapdown.recordings import Recording, read, write
+from strapdown.recordings import Recording
 
 ENDINGS = (".db3", ".mcap", ".bag")
 

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, vectors
+from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, scenarios, vectors
 from strapdown.ahrs import HAND_HELD, AhrsParameters
 from strapdown.checks import Array
 from strapdown.consistency import alignment, reference_errors
@@ -279,7 +279,7 @@ def main(
     progress: Callable[[str], None] | None = None,
 ) -> Result:
     """Run the study; JSON is written to ``out`` if it is given."""
-    recorded = [recordings.read(file) for file in files]  # fails first if a file cannot be read
+    recorded = [strapdown.read(file) for file in files]  # fails first if a file cannot be read
     scene = scenario(duration)
     base = setup.FilterSetup.for_scenario(scene, states=False)
     plan = montecarlo.Plan(scenario=scene, setup=base, seed=seed, epochs=20)

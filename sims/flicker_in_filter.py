@@ -93,7 +93,7 @@ def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, 
     -------
     Result
     """
-    outcomes = tuple(judge(datasheets.preset(name), runs, duration, seed, rate) for name in presets)
+    outcomes = tuple(judge(datasheets.PRESETS[name], runs, duration, seed, rate) for name in presets)
     result = Result(outcomes=outcomes, runs=runs, duration=duration)
     if out is not None:
         page, ax = plots.new_figure(size=(9.0, 4.5))

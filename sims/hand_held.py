@@ -33,6 +33,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
+import strapdown
 from strapdown import ahrs, estimation, plots, quaternion, recordings
 from strapdown.ahrs import HAND_HELD, AhrsEstimate, AhrsParameters
 from strapdown.checks import Array, InputError
@@ -502,7 +503,7 @@ def main(
     ``latency`` in ms is the delay that *compensated* removes; that of simulated recordings is 0. Table, JSON and figures are written to
     ``out`` if it is given; ``progress`` is called with a line for each recording.
     """
-    read = [recordings.read(file) for file in files] or [simulated(seed, k, duration) for k in range(runs)]
+    read = [strapdown.read(file) for file in files] or [simulated(seed, k, duration) for k in range(runs)]
     for recording in read:
         if recording.true_attitude is None:
             raise InputError(f"{recording.source} has no reference attitude to compare with; give BROAD files")

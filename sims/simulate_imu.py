@@ -53,7 +53,7 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
     -------
     Result
     """
-    whole = dataclasses.replace(datasheets.preset(preset).spec, g_sensitivity=np.zeros((3, 3)), turn_on_bias_sigma=0.0)
+    whole = dataclasses.replace(datasheets.PRESETS[preset].spec, g_sensitivity=np.zeros((3, 3)), turn_on_bias_sigma=0.0)
     edges = np.arange(samples + 1) / rate
     outputs = {}
     for name, fields in {**{part: (field,) for part, field in PARTS.items()}, "whole": tuple(PARTS.values())}.items():

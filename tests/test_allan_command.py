@@ -36,7 +36,7 @@ def test_the_scenario_at_rest_gives_its_preset_back(succeeds, tmp_path):
     said = succeeds("allan", "rest.h5")
     assert "432000 samples at 10 Hz, 12 h" in said
     spec, text = written(tmp_path)
-    preset = datasheets.preset("adis16470").spec
+    preset = datasheets.PRESETS["adis16470"].spec
     content = json.loads((tmp_path / "allan-results" / "allan.json").read_text(encoding="utf-8"))
     for term, most in (("angle_random_walk", 0.006), ("bias_instability", 0.1), ("rate_random_walk", 0.35)):
         truth = getattr(preset, term)

@@ -13,7 +13,7 @@ import typer
 
 import strapdown
 from strapdown import cli, recordings, scenarios
-from strapdown.cli import layout
+from strapdown.cli import COMMANDS
 from strapdown.cli.terminal import app
 from strapdown.estimation.setup import read_estimate
 from strapdown.montecarlo.coning_study import ALGORITHMS
@@ -44,7 +44,7 @@ def test_help_names_the_commands(succeeds):
 def test_help_shows_options_in_groups_and_examples_that_parse(run):
     """Each example names options and arguments that its command takes; each heading stands over its options."""
     commands = typer.main.get_command(app).commands
-    for examples in layout.COMMANDS.values():
+    for examples in COMMANDS.values():
         for name, (module, *lines) in examples.items():
             assert (
                 commands[name].callback.__module__ == f"strapdown.cli.{module}"

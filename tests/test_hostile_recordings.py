@@ -361,7 +361,7 @@ def test_within_hdf5_an_interruption_waits_for_the_end(tmp_path):
         interrupted()
     assert len(read) == 1
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    other = threading.Thread(target=lambda: read.append(recordings.is_estimate(path)))
+    other = threading.Thread(target=lambda: read.append(reading.kind(path)))
     other.start()
     other.join()
-    assert read[1:] == [False]
+    assert read[1:] == [""]

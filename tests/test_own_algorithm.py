@@ -19,7 +19,7 @@ from strapdown.units import DEGREE
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 IGNAGNI = coning.read_algorithms(EXAMPLES / "ignagni-1996.toml")
-MILLER = Algorithm.from_toml(EXAMPLES / "miller-1983.toml")
+MILLER = coning.named(str(EXAMPLES / "miller-1983.toml"))
 
 
 @pytest.mark.parametrize("own", IGNAGNI, ids=lambda one: one.name)
@@ -157,13 +157,13 @@ def test_bad_files_are_refused_with_their_place(tmp_path, text, message):
     path = tmp_path / "own.toml"
     path.write_text(f"[algorithm]\n{text}\n")
     with pytest.raises(InputError, match=message) as refused:
-        Algorithm.from_toml(path)
+        coning.named(str(path))
     assert "own.toml" in str(refused.value)
 
 
 def test_several_algorithms_need_names_of_their_own(tmp_path):
     with pytest.raises(InputError, match="holds 4 algorithms"):
-        Algorithm.from_toml(EXAMPLES / "ignagni-1996.toml")
+        coning.named(str(EXAMPLES / "ignagni-1996.toml"))
     path = tmp_path / "own.toml"
     path.write_text(2 * '[[algorithm]]\nname = "x"\ncoefficients = ["2/3"]\n')
     with pytest.raises(InputError, match="two algorithms of the name x"):

@@ -17,6 +17,7 @@ from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, formats, read, trajectories
+from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
@@ -340,6 +341,9 @@ def test_a_folder_of_euroc_is_read_with_its_truth_between_its_stamps(tmp_path, t
     assert (expected * found.inv()).magnitude().max() < 1e-12
     assert f"Reference of {truth}/data.csv" in recording.remarks[1]
     np.testing.assert_array_equal(read(folder / "mav0").rate, recording.rate)
+    reference = read_attitudes(folder)
+    assert reference.stamps_ns.tolist() == stamps[known].tolist()
+    np.testing.assert_array_equal(reference.attitude, recording.true_attitude[known])
 
 
 def test_a_trajectory_is_a_reference(tmp_path):

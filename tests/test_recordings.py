@@ -6,7 +6,8 @@ import pytest
 from measured import series_of
 from typer.testing import CliRunner
 
-from strapdown import estimation, recordings
+import strapdown
+from strapdown import estimation, motion, recordings, vectors
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
@@ -185,6 +186,7 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     path = csv("time,gx [rad/s],gy,gz,ax,ay,az")
     refused(path, "unit of its accelerometer")
     alone = read(path, gyro_alone=True)
+    np.testing.assert_array_equal(strapdown.read(path, gyro_alone=True).rate, alone.rate)
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
     assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
@@ -225,6 +227,17 @@ def test_vectors_of_a_record_are_at_their_stamps():
     np.testing.assert_array_equal(found.specific_force, [g, none, none, 3.0 * g])
     assert found.magnetic_field is None
     assert "Left out: magnetometer (direction)." in " ".join(found.remarks)
+
+
+def test_the_magnetometer_of_a_simulated_record_is_in_tesla(tmp_path):
+    field = np.array([2e-5, 0.0, -4e-5])
+    sensor = vectors.Magnetometer(name="magnetometer", kind="vector", field_f=field, sigma=1e-9, rate=10.0)
+    scenario = strapdown.Scenario(
+        motion=motion.rest(), gyro=strapdown.GyroSpec(), sensors=(sensor,), rate=10.0, duration=2.0
+    )
+    strapdown.write(strapdown.simulate(scenario), tmp_path / "unit.h5")
+    found = recordings.read_samples(tmp_path / "unit.h5", "magnetometer")
+    np.testing.assert_allclose(found.values, np.broadcast_to(field, found.values.shape), atol=1e-8)
 
 
 @pytest.mark.parametrize("mark", [";", "\t", "|"])

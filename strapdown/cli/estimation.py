@@ -132,8 +132,7 @@ class _Output:
 
     out: Path = Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
     to: list[Path] | None = Option(
-        None,
-        help="Also write this file: .csv, .tsv, .parquet, .tum; of a recording .bag, .mcap, .db3; repeatable.",
+        None, help="Also write this file: .csv, .tsv, .parquet, .tum; of a recording .bag, .mcap, .db3; repeatable."
     )
     euler: str | None = Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = Option(None, help="With --to: fixed frame, enu (default) or ned; body axes are not changed.")
@@ -185,7 +184,9 @@ def estimate(
         ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
     ui.say(*run.estimate.remarks)
     ui.show(run.estimate.listing())
-    _clear(out)
+    figures = (f"{name}.{one}" for name in FIGURES for one in ("png", "pdf", "svg"))
+    for name in (*FILES[1:], *figures, *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
+        (out / name).unlink(missing_ok=True)
     contents = _shown(run, observability=shared.observability)
     if field is not None:
         compared = field.compared(source, run.estimate)
@@ -245,13 +246,6 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, d
         if "source" in chosen.estimate_options and sd.recordings.format_of(recording) is chosen and not changed:
             exports[target]["source"] = recording
     return exports
-
-
-def _clear(out: Path) -> None:
-    """Remove the files of an earlier estimate from the folder, some of which the next one may not write."""
-    figures = (f"{name}.{form}" for name in FIGURES for form in ("png", "pdf", "svg"))
-    for name in (*FILES[1:], *figures, *ABOUT_IT):
-        (out / name).unlink(missing_ok=True)
 
 
 def _drawn(out: Path, form: ui.Format, result: Estimate, title: str) -> list[Path]:

@@ -45,9 +45,6 @@ def export(
 @ui.command
 def info() -> None:
     """Print the versions and the processor features used by compiled code."""
-    import strapdown
     from strapdown.kernels.machine import describe
 
-    ui.say(f"strapdown {strapdown.__version__}")
-    for name, value in describe().items():
-        ui.say(f"{name}: {value}")
+    ui.say(f"strapdown {sd.__version__}", *(f"{name}: {value}" for name, value in describe().items()))

@@ -40,7 +40,7 @@ class Samples:
         return {name: unit for name in names if (unit := getattr(self, f"{name}_unit"))}
 
     def options(self, path: Path) -> dict[str, Any]:
-        """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
+        """Return the options of :func:`strapdown.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
         given = options_given(self)
@@ -72,7 +72,7 @@ class Layout(Samples):
     )
 
     def options(self, path: Path) -> dict[str, Any]:
-        """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
+        """Return the options of :func:`strapdown.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
         options = super().options(path)

@@ -12,7 +12,7 @@ import strapdown as sd
 from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.files import writable
+from strapdown.files import reading, writable
 
 
 @ui.command
@@ -77,7 +77,8 @@ def convert(
     """Convert a recording, a simulated record or an estimate; the format of IN is detected, that of OUT is given by its suffix."""
     from strapdown import recordings
 
-    options, estimate, simulated = layout.options(source), recordings.is_estimate(source), recordings.is_record(source)
+    options, kind = layout.options(source), reading.kind(source)
+    estimate, simulated = kind == "strapdown estimate", kind == "strapdown record"
     suffixes = recordings.writers("write_estimate" if estimate else "write")
     writable("OUT", target, suffixes=suffixes, sources=(source, reference))
     if target.exists() and not force:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError, count
+from strapdown.checks import InputError, count, one_of
 from strapdown.cli import terminal as ui
 from strapdown.cli.reading import Layout
 from strapdown.files import write_json, write_text
@@ -58,7 +58,8 @@ class _Filter:
             return None
         if Path(self.prior).suffix == ".toml":
             return sd.gyro.read_spec(self.prior)
-        return sd.gyro.datasheets.preset(self.prior).spec
+        presets = sd.gyro.datasheets.PRESETS
+        return presets[one_of("--prior", self.prior, presets)].spec
 
 
 @dataclass(frozen=True)

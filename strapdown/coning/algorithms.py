@@ -99,10 +99,6 @@ class Algorithm:
             checks.count(f"{self.name}: {what}", getattr(self, what), minimum=0)
         if self.rate_points % 2:
             raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
-        self._check_window()
-        self._check_tables()
-
-    def _check_window(self) -> None:
         if self.solver == "compressed" and self.following:
             raise InputError(
                 f"{self.name}: following is {self.following}, but the compressed solver uses no increments after the step; "
@@ -112,8 +108,6 @@ class Algorithm:
             raise InputError(
                 f"{self.name}: solver {self.solver!r} uses only the increments of the step; previous and following must be 0"
             )
-
-    def _check_tables(self) -> None:
         m = self.window
         own = _TABLES.get(self.solver)
         for what in _TABLES.values():
@@ -295,27 +289,6 @@ class Algorithm:
             )
         return made
 
-    @classmethod
-    def from_toml(cls, path: str | os.PathLike[str]) -> Algorithm:
-        """Read the one table ``[algorithm]`` of a TOML file.
-
-        Parameters
-        ----------
-        path : path-like
-            File; for a file with several tables see :func:`read_algorithms`.
-
-        Returns
-        -------
-        Algorithm
-            The algorithm.
-        """
-        found = read_algorithms(path)
-        if len(found) > 1:
-            raise InputError(
-                f"{path} holds {len(found)} algorithms; use coning.read_algorithms, or keep one in the file"
-            )
-        return found[0]
-
     def to_table(self) -> dict[str, Any]:
         """Return the algorithm as a table for :meth:`from_table`.
 
@@ -323,11 +296,6 @@ class Algorithm:
         -------
         dict
             Table; exists for rotation-vector algorithms only.
-
-        Raises
-        ------
-        InputError
-            If the solver has no table.
         """
         table: dict[str, Any] = {"name": self.name, "samples": self.samples}
         if self.previous:
@@ -509,28 +477,22 @@ def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorit
     )
 
 
-def uncompressed_taylor(samples: int) -> Algorithm:
+def uncompressed(name: str, samples: int, pairs: Table, source: str) -> Algorithm:
+    """Return a rotation-vector algorithm with all cross products."""
+    return Algorithm(name=name, solver="pairs", samples=samples, order=4, pairs=pairs, source=source)
+
+
+def time_taylor(samples: int) -> Algorithm:
     """Return the rotation-vector algorithm exact, to second order, for a rate polynomial of degree N − 1."""
-    return Algorithm(
-        name=f"time-taylor-{samples}",
-        solver="pairs",
-        samples=samples,
-        order=4,
-        pairs=exact.taylor_pairs(samples),
-        source="Jordan 1969; Savage 1998; Song 2013",
-    )
+    pairs = exact.taylor_pairs(samples)
+    return uncompressed(f"time-taylor-{samples}", samples, pairs, "Jordan 1969; Savage 1998; Song 2013")
 
 
 def uncompressed_optimal(samples: int) -> Algorithm:
     """Return the uncompressed algorithm that is optimal under coning and otherwise closest to the time-Taylor algorithm."""
-    return Algorithm(
-        name=f"uncompressed-{samples}",
-        solver="pairs",
-        samples=samples,
-        order=4,
-        pairs=exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples)),
-        source="Song 2013, with the free coefficients of matched_correction",
-    )
+    pairs = exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples))
+    source = "Song 2013, with the free coefficients of matched_correction"
+    return uncompressed(f"uncompressed-{samples}", samples, pairs, source)
 
 
 def polynomial(samples: int) -> Algorithm:
@@ -613,7 +575,7 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
         for n, number in enumerate(_NUMBERS, start=1):
             makers[f"{number}-sample" + (f"-previous-{p}" if p else "")] = functools.partial(compressed, n, p)
     for n in range(2, 7):
-        makers[f"time-taylor-{n}"] = functools.partial(uncompressed_taylor, n)
+        makers[f"time-taylor-{n}"] = functools.partial(time_taylor, n)
     for n in range(2, 7):
         makers[f"uncompressed-{n}"] = functools.partial(uncompressed_optimal, n)
     for n in range(2, 9):
@@ -639,11 +601,14 @@ ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
-    """Return the algorithm of a name in :data:`ALGORITHMS` or of a FILE.toml (:meth:`Algorithm.from_toml`), or the one given."""
+    """Return the algorithm of a name in :data:`ALGORITHMS`, the one of a FILE.toml (:func:`read_algorithms`), or the one given."""
     if isinstance(algorithm, Algorithm):
         return algorithm
     if isinstance(algorithm, str) and algorithm.lower().endswith(".toml"):
-        return Algorithm.from_toml(algorithm)
+        found = read_algorithms(algorithm)
+        if len(found) > 1:
+            raise InputError(f"{algorithm} holds {len(found)} algorithms; choose one of coning.read_algorithms")
+        return found[0]
     return ALGORITHMS[checks.one_of("algorithm", algorithm, ALGORITHMS)]
 
 

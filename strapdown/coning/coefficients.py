@@ -248,22 +248,9 @@ def rate_weights(points: int, interval: int | None = None) -> Rationals:
     Two points: the trapezoidal rule, ½ and ½. Four: −1/24, 13/24, 13/24, −1/24.
     """
     start = Fraction(points // 2 - 1 if interval is None else interval)
-    weights = []
-    for node in range(points):
-        polynomial = [Fraction(1)]
-        for other in range(points):
-            if other != node:
-                scale = Fraction(1, node - other)
-                zero = Fraction(0)
-                shifted = zip([zero, *polynomial], [*polynomial, zero], strict=True)
-                polynomial = [scale * (low - other * high) for low, high in shifted]
-        weights.append(
-            sum(
-                (c * ((start + 1) ** (k + 1) - start ** (k + 1)) / (k + 1) for k, c in enumerate(polynomial)),
-                Fraction(0),
-            )
-        )
-    return tuple(weights)
+    powers = range(points)  # that the weights integrate exactly
+    integrals = [((start + 1) ** (k + 1) - start ** (k + 1)) / (k + 1) for k in powers]
+    return solve([[Fraction(node) ** k for node in range(points)] for k in powers], integrals)
 
 
 def squared_gain(points: int, terms: int) -> Rationals:

@@ -12,7 +12,7 @@ from pathlib import Path
 from strapdown import checks
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import Algorithm, named
-from strapdown.files import reading
+from strapdown.files import reading, tables
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
@@ -121,7 +121,7 @@ def vibration_drift(lines: Sequence[VibrationLine], algorithm: str | Algorithm, 
     return math.fsum(drifts)
 
 
-_COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
+_FORM = {"frequency": tables.HERTZ, **dict.fromkeys(("angle", "angle_across", "phase"), tables.DEGREES)}
 
 
 def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
@@ -131,29 +131,15 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
         text = reading.text(file).splitlines()
         rows = csv.reader(line for line in text if line.strip() and not line.lstrip().startswith("#"))
         names = [name.strip() for name in next(rows, [])]
-        checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
-        lacking = [name for name in _COLUMNS[:2] if name not in names]
-        if lacking:
-            raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; give {', '.join(_COLUMNS)}")
-        lines = []
+        lines: list[VibrationLine] = []
         for k, row in enumerate(rows):
+            place = f"{file.name}: data row {k + 1}"
             if len(row) != len(names):
-                raise InputError(f"{file.name}: data row {k + 1} has {len(row)} fields, the header {len(names)}")
-            cell = {
-                name: _number(f"{file.name}: data row {k + 1}, {name}", field)
-                for name, field in zip(names, row, strict=True)
-            }
-            across = cell.get("angle_across_deg")
-            lines.append(
-                VibrationLine(
-                    frequency=cell["frequency_hz"],
-                    angle=cell["angle_deg"] * DEGREE,
-                    angle_across=None if across is None else across * DEGREE,
-                    phase=cell.get("phase_deg", 90.0) * DEGREE,
-                )
-            )
+                raise InputError(f"{place} has {len(row)} fields, the header {len(names)}")
+            cells = {name: _number(f"{place}, {name}", field) for name, field in zip(names, row, strict=True)}
+            lines.append(tables.build(VibrationLine, cells, _FORM, place))
         if not lines:
-            raise InputError(f"{file.name} has a header but no lines")
+            raise InputError(f"{file.name} has no lines below a header; give {', '.join(tables.keys(_FORM))}")
         largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
         if largest >= 90.0 * DEGREE:
             raise InputError(

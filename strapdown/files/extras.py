@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from strapdown.checks import InputError
@@ -16,12 +15,3 @@ def library(name: str, what: str, extra: str = "formats") -> Any:
     except ImportError as error:
         package = name.partition(".")[0].replace("_", "-")
         raise InputError(f"{what} needs {package} ({error}); pip install 'strapdown[{extra}]'") from None
-
-
-def with_ending(path: Path, ending: str, folder: Path) -> Path:
-    """Return a path to the file with that extension, which some libraries require: if necessary, a link in ``folder``."""
-    if path.suffix.lower() == ending:
-        return path
-    link = folder / f"{path.stem}{ending}"
-    link.symlink_to(path.absolute())
-    return link

@@ -336,8 +336,8 @@ def is_hdf5(path: Name) -> bool:
 
 
 def kind(path: Name) -> str:
-    """Return the kind of an HDF5 file of this package, such as "strapdown estimate"; empty for any other file."""
-    if not is_hdf5(path):
+    """Return the kind of an HDF5 file of this package, such as "strapdown estimate"; empty for any other file or folder."""
+    if Path(path).is_dir() or not is_hdf5(path):
         return ""
     with hdf5(path) as file:
         found = str(attributes(file).get("kind", ""))

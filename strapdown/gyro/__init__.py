@@ -23,10 +23,4 @@ from strapdown.gyro.model import sampling as sampling
 from strapdown.gyro.model import simulate as simulate
 from strapdown.gyro.model import to_table as to_table
 
-__all__ = [
-    "GyroSpec",
-    "matched_process_noise",
-    "process_noise",
-    "read_spec",
-    "simulate",
-]
+__all__ = ["GyroSpec", "matched_process_noise", "process_noise", "read_spec", "simulate"]

@@ -15,15 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.checks import InputError, known_keys
 from strapdown.files import reading
 from strapdown.gyro.model import GyroSpec, from_table
 
-__all__ = [
-    "PRESETS",
-    "from_datasheet",
-    "preset",
-]
+__all__ = ["PRESETS", "from_datasheet"]
 
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),
@@ -116,20 +112,9 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     for name, text in quantities.items():
         field, wanted, example = _QUANTITIES[name]
         number = parse(name, text, wanted, example)
-        values[field] = _shaped(name, number)
+        shapes = {"misalignment": 1.0 - np.eye(3), "g_sensitivity": np.eye(3)}
+        values[field] = number / np.sqrt(12.0) if name == "angle_resolution" else number * shapes.get(name, 1.0)
     return GyroSpec(**values)
-
-
-def _shaped(name: str, number: float) -> float | Array:
-    if name == "angle_resolution":
-        return float(number / np.sqrt(12.0))
-    if name in ("scale_factor", "asymmetry"):
-        return np.full(3, number)
-    if name == "misalignment":
-        return number * (1.0 - np.eye(3))
-    if name == "g_sensitivity":
-        return number * np.eye(3)
-    return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,24 +147,3 @@ PRESETS = {
     name: Preset(name=name, **table) for name, table in reading.toml(Path(__file__).with_name("presets.toml")).items()
 }
 """Presets by name, from consumer MEMS to navigation grade."""
-
-
-def preset(name: str) -> Preset:
-    """Return a preset by name.
-
-    Parameters
-    ----------
-    name : str
-        Key of :data:`PRESETS`.
-
-    Returns
-    -------
-    Preset
-        The preset.
-
-    Examples
-    --------
-    >>> preset("stim300").grade
-    'tactical MEMS'
-    """
-    return PRESETS[one_of("preset", name, PRESETS)]

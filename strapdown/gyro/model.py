@@ -48,14 +48,6 @@ Axes = float | Array
 """One number for all axes, or an array (3,) of one per axis."""
 
 
-def _zeros() -> Array:
-    return np.zeros(3)
-
-
-def _zero_matrix() -> Array:
-    return np.zeros((3, 3))
-
-
 _BY_AXIS = {
     "angle_random_walk": "rad/√s",
     "bias_instability": "rad/s",
@@ -137,12 +129,12 @@ class GyroSpec(ByValue):
     rate_ramp: Axes = 0.0
     markov_noise: Axes = 0.0
     markov_correlation_time: float = np.inf
-    turn_on_bias: Array = field(default_factory=_zeros)
+    turn_on_bias: Array = field(default_factory=lambda: np.zeros(3))
     turn_on_bias_sigma: Axes = 0.0
-    scale_factor: Array = field(default_factory=_zeros)
-    asymmetry: Array = field(default_factory=_zeros)
-    misalignment: Array = field(default_factory=_zero_matrix)
-    g_sensitivity: Array = field(default_factory=_zero_matrix)
+    scale_factor: Array = field(default_factory=lambda: np.zeros(3))
+    asymmetry: Array = field(default_factory=lambda: np.zeros(3))
+    misalignment: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
     temperature: BiasOverTemperature | None = None
     bandwidth: float = np.inf
     damping: float = 0.7071067811865476
@@ -280,21 +272,15 @@ def simulate(
     for axis in range(3):
         compiled(noise.fill_normals)(streams[axis, _INITIAL], np.empty((2, 32), np.uint64), initial[axis])
     increments, bias = np.empty((n, 3)), np.empty((n + 1, 3))
-    words, normals = np.empty((2, gyro_errors.BLOCK // 2), np.uint64), np.zeros((4, gyro_errors.BLOCK))
-    compiled(gyro_errors.drift_and_noise)(
-        read_only(stamps),
-        read_only(exact),
-        *_errors(spec, initial, n, low_passed),
-        gyro_errors.Draws(streams, words, normals),
-        increments,
-        bias,
+    draws = gyro_errors.Draws(
+        streams, np.empty((2, gyro_errors.BLOCK // 2), np.uint64), np.zeros((4, gyro_errors.BLOCK))
     )
+    errors = _errors(spec, initial, n, low_passed)
+    compiled(gyro_errors.drift_and_noise)(read_only(stamps), read_only(exact), *errors, draws, increments, bias)
     _add_environment(spec, stamps, specific_force, temperature, increments, bias)
     if low_passed:
-        white = _axes(spec.angle_random_walk)
-        increments = _low_pass(
-            spec, increments, (stamps[-1] - stamps[0]) / n, white, initial, streams[:, _LOW_PASS:], words, normals
-        )
+        own = draws._replace(streams=np.ascontiguousarray(streams[:, _LOW_PASS:]))
+        increments = _low_pass(spec, increments, (stamps[-1] - stamps[0]) / n, initial, own)
     rounded = [np.any(np.asarray(value) > 0.0) for value in (spec.quantization, spec.rate_resolution)]
     if np.isfinite(spec.range) or any(rounded):
         step = _axes(spec.quantization_step)
@@ -384,35 +370,15 @@ def _need_uniform(edges: Array) -> None:
         )
 
 
-def _low_pass(
-    spec: GyroSpec,
-    increments: Array,
-    dt: float,
-    white: Array,
-    initial: Array,
-    streams: np.ndarray,
-    words: np.ndarray,
-    normals: Array,
-) -> Array:
+def _low_pass(spec: GyroSpec, increments: Array, dt: float, initial: Array, draws: gyro_errors.Draws) -> Array:
     """Return the increments filtered by ``H(s) = ω²/(s² + 2ζωs + ω²)``, with the white noise, exact over each interval."""
-    natural, damping = 2.0 * np.pi * spec.bandwidth, spec.damping
-    transition, factor = low_pass_step(natural, damping, dt)
+    natural, damping, white = 2.0 * np.pi * spec.bandwidth, spec.damping, _axes(spec.angle_random_walk)
+    step = low_pass_step(natural, damping, dt)
     # Stationary: ȳ is the first mean rate; the white noise gives var y = σ_v² ω/(4ζ), var ẏ = σ_v² ω³/(4ζ), uncorrelated.
     sigma = white * np.sqrt(natural / (4.0 * damping))
     state = np.stack([increments[0] / dt + sigma * initial[:, -3], sigma * natural * initial[:, -4]], axis=1)
     out = np.empty_like(increments)
-    compiled(gyro_errors.low_pass)(
-        dt,
-        transition,
-        factor,
-        white,
-        np.ascontiguousarray(state),
-        np.ascontiguousarray(streams),
-        words,
-        normals,
-        increments,
-        out,
-    )
+    compiled(gyro_errors.low_pass)(dt, *step, white, np.ascontiguousarray(state), *draws, increments, out)
     return out
 
 
@@ -500,11 +466,6 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
     -------
     dict
         ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s, the maximum over the axes.
-
-    Raises
-    ------
-    InputError
-        If the gyro has flicker and no bandwidth is given.
 
     Notes
     -----

@@ -14,15 +14,7 @@ from numpy.typing import ArrayLike
 from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.exact_phase import DIGITS, cosine_sine, exact_sum, harmonic_integrals, to_decimal, to_pair
-from strapdown.motion.protocol import (
-    IDENTITY,
-    edge_stamps,
-    stacked,
-    store_attitude,
-    store_number,
-    store_vector,
-    times,
-)
+from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_number, store_vector, times
 
 
 @dataclass(frozen=True, kw_only=True)

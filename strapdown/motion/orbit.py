@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, array, finite, positive
 
-__all__ = [
-    "CircularOrbit",
-]
+__all__ = ["CircularOrbit"]
 
 EARTH_RADIUS = 6371.2e3
 """Mean radius of the earth, m; the reference radius of the geomagnetic field."""

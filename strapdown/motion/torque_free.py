@@ -20,6 +20,8 @@ from strapdown.motion.exact_phase import DIGITS, Pair, cosine_sine, halved, prod
 from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_vector, times
 from strapdown.motion.quadrature import interval_integrals
 
+PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494")
+"""π to :data:`DIGITS` digits."""
 _SMALLEST_SINE = 1e-140
 _SEPARATRIX = Decimal("1e-300")
 """Value of 1 − m used on the separatrix instead of 0: the motions differ only after 340 time constants of leaving the middle axis."""
@@ -176,7 +178,7 @@ def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
         complement = to_decimal(middling * (i3 - i1) / ((i3 - i2) * narrow)) or _SEPARATRIX  # 1 − m
         quarter, third_kind, means = complete_integrals(complement, n)
         tilt = to_decimal(i3) * a3 / momentum / (1 - n).sqrt()
-        turn = momentum / to_decimal(i3) * 2 * quarter / p + pitch / p * (2 * third_kind - tilt * decimal_pi())
+        turn = momentum / to_decimal(i3) * 2 * quarter / p + pitch / p * (2 * third_kind - tilt * PI)
         sine, cosine = float(to_decimal(w2) / a2), float(to_decimal(w1) / a1)
         # u_0 in [−2K, 2K] from its sn and cn.
         start = sine * float(elliprf(cosine**2, float(complement + (1 - complement) * Decimal(cosine) ** 2), 1.0))
@@ -246,17 +248,6 @@ def _jacobi(s: _Solution, u: Array) -> tuple[Array, Array, Array]:
     return np.where(small & (np.abs(turned) < 1.0), u, sn), np.asarray(c * sn), np.asarray(dn)
 
 
-@functools.cache
-def decimal_pi() -> Decimal:
-    """Return π to :data:`DIGITS` digits (Gauss and Legendre)."""
-    with localcontext(prec=DIGITS):
-        a, b, t, power = Decimal(1), 1 / Decimal(2).sqrt(), Decimal(1) / 4, 1
-        for _ in range(7):
-            mean = (a + b) / 2
-            b, t, power, a = (a * b).sqrt(), t - power * (a - mean) ** 2, 2 * power, mean
-        return (a + b) ** 2 / (4 * t)
-
-
 def complete_integrals(complement: Decimal, characteristic: Decimal) -> tuple[Decimal, Decimal, tuple[Pair, ...]]:
     """Return K(m) and Π(n|m) for complement = 1 − m > 0 and n < 1, and the means (DLMF 19.8.1, 19.8.6)."""
     a, g, p = Decimal(1), complement.sqrt(), (1 - characteristic).sqrt()
@@ -270,5 +261,5 @@ def complete_integrals(complement: Decimal, characteristic: Decimal) -> tuple[De
         term = term * (squared - product) / (squared + product) / 2
         p = (squared + product) / (2 * p)
         a, g = (a + g) / 2, product.sqrt()
-    first = decimal_pi() / (2 * a)
+    first = PI / (2 * a)
     return first, first * (1 + characteristic / (1 - characteristic) / 2 * total), (*means, (float(a), float(g)))

@@ -11,36 +11,32 @@ from matplotlib.figure import Figure
 from strapdown.allan import AllanDeviation, NoiseFit, curves_by_axis
 from strapdown.allan.noise_fit import UNITS, name
 from strapdown.checks import Array
-from strapdown.plots.style import (
-    AXES,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    YELLOW,
-    axes_or_new,
-    ink,
-    legend_below,
-    new_figure,
-)
+from strapdown.plots import style
 
 
 def allan_axis(
     deviation: AllanDeviation, fit: NoiseFit, curves: Mapping[str, Array], axis: int, ax: Axes | None = None
 ) -> Axes:
     """Draw one axis of an Allan deviation with its confidence band, the fit, and the fitted terms (``curves``, SI at the same τ)."""
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     unit, scale = UNITS[fit.sensor]["bias_instability"]
     upper = np.where(np.isfinite(deviation.upper[axis]), deviation.upper[axis], np.nan)
     band = (deviation.lower[axis] / scale, upper / scale)
     ax.fill_between(
-        deviation.taus, *band, color=SKY, alpha=0.5, linewidth=0, label=f"{100 * deviation.level:.0f} % confidence"
+        deviation.taus,
+        *band,
+        color=style.SKY,
+        alpha=0.5,
+        linewidth=0,
+        label=f"{100 * deviation.level:.0f} % confidence",
     )
-    ax.loglog(deviation.taus, deviation.deviation[axis] / scale, "o", color=BLUE, markersize=2.5, label="measured")
-    ax.loglog(deviation.taus, curves["total"] / scale, color=ink(), linewidth=1.4, label="fit")
-    colors = dict(zip(fit.terms, (PURPLE, VERMILION, GREEN, ORANGE, YELLOW), strict=False))
+    ax.loglog(
+        deviation.taus, deviation.deviation[axis] / scale, "o", color=style.BLUE, markersize=2.5, label="measured"
+    )
+    ax.loglog(deviation.taus, curves["total"] / scale, color=style.ink(), linewidth=1.4, label="fit")
+    colors = dict(
+        zip(fit.terms, (style.PURPLE, style.VERMILION, style.GREEN, style.ORANGE, style.YELLOW), strict=False)
+    )
     for i, term in enumerate(fit.terms):
         if fit.supported[axis, i]:
             ax.loglog(
@@ -75,12 +71,12 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
     """
     unit, scale = UNITS[fit.sensor]["bias_instability"]
     number = len(deviation.deviation)
-    figure, axes = new_figure(1, number, size=(1.2 + 3.0 * number, 4.2), sharey=True, squeeze=False)
+    figure, axes = style.new_figure(1, number, size=(1.2 + 3.0 * number, 4.2), sharey=True, squeeze=False)
     for axis, curves in enumerate(curves_by_axis(fit, deviation)):
         ax = allan_axis(deviation, fit, curves, axis, axes[0, axis])
-        ax.set_title(f"{AXES[axis]} axis", loc="left")
+        ax.set_title(f"{style.AXES[axis]} axis", loc="left")
         ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale
     axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())  # shared: those of the last axis could cut off others
-    legend_below(figure, list(axes[0]), ncols=8)
+    style.legend_below(figure, list(axes[0]), ncols=8)
     return figure

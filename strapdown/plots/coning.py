@@ -10,51 +10,40 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.montecarlo.coning_study import PROBABILITY, ConingStudy, Drift, FilterOutcome
+from strapdown.montecarlo.coning_study import PROBABILITY, ROUNDING, ConingStudy, Drift, FilterOutcome
+from strapdown.plots import style
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
-from strapdown.plots.style import (
-    SKY,
-    axes_or_new,
-    ink,
-    legend_above,
-    legend_below,
-    match_scales,
-    new_figure,
-    save_as,
-)
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
-
-_ROUNDING = 1e-6  # °/h: smaller drifts are rounding errors of the simulation
 
 
 def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     """Draw the magnitude of each algorithm's drift, measured and predicted, °/h on a log axis."""
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     places = np.arange(len(drifts))
     measured = np.array([abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts])
     predicted = np.array([abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts])
-    shown = [x for x in (*measured, *predicted) if x > _ROUNDING]
-    low, high = min(shown, default=_ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
+    shown = [x for x in (*measured, *predicted) if x > ROUNDING]
+    low, high = min(shown, default=ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
     ax.set_yscale("log")
     ax.set(xlim=(-0.6, len(drifts) - 0.4), ylim=(low, high))
     ax.bar(
         places,
-        np.where(measured > _ROUNDING, measured, np.nan),
+        np.where(measured > ROUNDING, measured, np.nan),
         width=0.55,
-        color=SKY,
+        color=style.SKY,
         label="measured relative to the closed form",
     )
-    lines = np.where(predicted > _ROUNDING, predicted, np.nan)
-    ax.hlines(lines, places - 0.36, places + 0.36, color=ink(), linewidth=2, label="predicted by the formula")
+    lines = np.where(predicted > ROUNDING, predicted, np.nan)
+    ax.hlines(lines, places - 0.36, places + 0.36, color=style.ink(), linewidth=2, label="predicted by the formula")
     for place, value, line in zip(places, measured, lines, strict=True):
-        text = f"{value:.3g}" if value > _ROUNDING else "rounding"
+        text = f"{value:.3g}" if value > ROUNDING else "rounding"
         top = max(value, np.nan_to_num(line), low)
         ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_xticks(places, [drift.algorithm.replace("-", "-\n", 1) for drift in drifts])
     ax.grid(visible=False, axis="x")
     ax.set_ylabel("magnitude of the drift about the cone's axis, °/h")
-    legend_above(ax)
+    style.legend_above(ax)
     return ax
 
 
@@ -66,7 +55,9 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw the errors about the cone's axis with the filter's ±3σ for each integration algorithm: attitude above, bias below."""
     rows = -(-len(outcomes) // MAX_COLUMNS)
     columns = -(-len(outcomes) // rows)
-    figure, grid = new_figure(2 * rows, columns, size=(2.2 * max(columns, 3), 5.2 * rows), sharex=True, squeeze=False)
+    figure, grid = style.new_figure(
+        2 * rows, columns, size=(2.2 * max(columns, 3), 5.2 * rows), sharex=True, squeeze=False
+    )
     # Attitude above bias, in as many pairs of rows as needed: (2, columns of all rows).
     axes = np.stack([np.concatenate(grid[0::2]), np.concatenate(grid[1::2])])
     for ax in axes[:, len(outcomes) :].ravel():
@@ -84,11 +75,11 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         axes[1, j].set_ylim(-top / DEGREE_PER_HOUR, top / DEGREE_PER_HOUR)
         axes[0, j].set_xlabel("")
     for row in axes:
-        match_scales(row)
+        style.match_scales(row)
     for first in range(0, len(outcomes), columns):
         axes[0, first].set_ylabel("attitude error, arcsec")
         axes[1, first].set_ylabel("bias error, °/h")
-    legend_below(figure, [axes[0, 0]])
+    style.legend_below(figure, [axes[0, 0]])
     figure.suptitle(
         "Errors about the cone's axis. The integration drift is a constant rate,\nwhich the filter estimates as gyro bias."
     )
@@ -97,7 +88,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
 
 def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter."""
-    figure, axes = new_figure(1, 3, size=(10.5, 4.6))
+    figure, axes = style.new_figure(1, 3, size=(10.5, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
     first = outcomes[0]
     percent = f"{100 * PROBABILITY:g} %"
@@ -109,7 +100,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
             first.statistics.time[first.epochs],
             np.full(len(first.epochs), 0.015),
             "|",
-            color=ink(),
+            color=style.ink(),
             markersize=5,
             transform=ax.get_xaxis_transform(),
             label="judged epoch",
@@ -126,7 +117,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
         low <= one.statistics.mean_nis <= high for one in outcomes for low, high in [one.statistics.nis_bounds()]
     ]
     axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nTest of the mean over all time", loc="left")
-    legend_below(figure, list(axes))
+    style.legend_below(figure, list(axes))
     return figure
 
 
@@ -138,7 +129,7 @@ def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) ->
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
     """Write the figures of a coning study to a folder, which is created if missing; return the files."""
-    figure, ax = new_figure(size=(7.0, 4.2))
+    figure, ax = style.new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)
     p = study.parameters
     figure.suptitle(
@@ -150,4 +141,4 @@ def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: 
         target / "errors": coning_errors(study.outcomes),
         target / "consistency": coning_consistency(study.outcomes),
     }
-    return save_as(figures, form)
+    return style.save_as(figures, form)

@@ -13,20 +13,8 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.consistency import errors
+from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
-from strapdown.plots.style import (
-    AXES,
-    BLUE,
-    CYCLE,
-    SKY,
-    VERMILION,
-    axes_or_new,
-    ink,
-    legend_above,
-    legend_below,
-    log_scale,
-    new_figure,
-)
 from strapdown.records import Estimate, Truth
 from strapdown.units import DEGREE, angle_unit, error_state_unit, rate_unit
 
@@ -34,14 +22,14 @@ THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""
 
 
-def band(ax: Axes, time: Array, low: Array, high: Array, **style: Any) -> None:
+def band(ax: Axes, time: Array, low: Array, high: Array, **look: Any) -> None:
     """Fill between two series (n,); for long series between the extremes of each column."""
     found = envelope(time, low, high)
     if len(time) <= BAND_COLUMNS:
-        ax.fill_between(*found, linewidth=0, **style)
+        ax.fill_between(*found, linewidth=0, **look)
         return
     ends = (np.append(found.time, time[-1]), np.append(found.low, found.low[-1]), np.append(found.high, found.high[-1]))
-    ax.fill_between(*ends, step="post", linewidth=0, **style)
+    ax.fill_between(*ends, step="post", linewidth=0, **look)
 
 
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
@@ -50,25 +38,25 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
     For a long series the band is dark up to the minimum 3σ of each pixel column and light up to the maximum: σ increases between two
     measurements, and lines that follow it would merge into a grey area that hides the errors.
     """
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     bound = 3.0 * sigma
     if len(time) <= BAND_COLUMNS:
-        band(ax, time, -bound, bound, color=SKY, alpha=0.35, label=f"{THREE_SIGMA} of the filter")
+        band(ax, time, -bound, bound, color=style.SKY, alpha=0.35, label=f"{THREE_SIGMA} of the filter")
     else:
         found = envelope(time, bound)
         edges = np.append(found.time, time[-1])
         least, most = (np.append(values, values[-1]) for values in (found.low, found.high))
-        inner: dict[str, Any] = {"color": SKY, "alpha": 0.35, "linewidth": 0, "step": "post"}
+        inner: dict[str, Any] = {"color": style.SKY, "alpha": 0.35, "linewidth": 0, "step": "post"}
         outer = {**inner, "alpha": 0.18}
         ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **inner)
         if (most > 1.02 * least).any():
             ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **outer)
             ax.fill_between(edges, -most, -least, **outer)
-    ax.axhline(0.0, color=ink(), linewidth=0.6)
+    ax.axhline(0.0, color=style.ink(), linewidth=0.6)
     for k, one in enumerate(error):
         ax.plot(
             *decimated(time, one),
-            color=VERMILION,
+            color=style.VERMILION,
             linewidth=0.8,
             alpha=0.8,
             label=f"error, {len(error)} runs" if k == 0 and len(error) > 1 else "error" if k == 0 else None,
@@ -102,10 +90,10 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
     """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias with its ±3σ, and the attitude's σ over time."""
-    figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
+    figure, axes = style.new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
     for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
-        ax.plot(*unbroken(estimate.time, angle), color=BLUE, linewidth=0.9)
+        ax.plot(*unbroken(estimate.time, angle), color=style.BLUE, linewidth=0.9)
         ax.set_ylabel(f"{name.split()[0]}, °")
         if np.ptp(angle) > 180.0:
             ax.yaxis.set_major_locator(MultipleLocator(90.0))
@@ -114,28 +102,28 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     settled = slice(len(estimate.time) // 20, None)
     reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
     unit, size = rate_unit(3.0 * sigma[settled, 3:])
-    for k, name in enumerate(AXES):
+    for k, name in enumerate(style.AXES):
         bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, 3 + k] / size
-        band(axes[3], estimate.time, bias - spread, bias + spread, color=CYCLE[k], alpha=0.18)
+        band(axes[3], estimate.time, bias - spread, bias + spread, color=style.CYCLE[k], alpha=0.18)
         axes[3].plot(
-            *decimated(estimate.time, bias), color=CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
+            *decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
         )
     axes[3].set_ylim(-1.2 * reach / size, 1.2 * reach / size)
     axes[3].set_ylabel(f"gyro bias, {unit}")
-    legend_above(axes[3])
+    style.legend_above(axes[3])
     total = np.linalg.norm(sigma[:, :3], axis=1)
     unit, size = angle_unit(total[settled])
     words = "root sum square of the three axes"
     if len(total) <= BAND_COLUMNS:
-        axes[4].plot(estimate.time, total / size, color=ink(), linewidth=1.0)
+        axes[4].plot(estimate.time, total / size, color=style.ink(), linewidth=1.0)
     else:  # a line that follows the changes of σ between measurements would be a black area
-        band(axes[4], estimate.time, total / size, total / size, color=SKY)
-        axes[4].plot(*envelope(estimate.time, total / size)[::2], color=ink(), linewidth=0.8)
+        band(axes[4], estimate.time, total / size, total / size, color=style.SKY)
+        axes[4].plot(*envelope(estimate.time, total / size)[::2], color=style.ink(), linewidth=0.8)
         words += ", minimum to maximum of each pixel"
     axes[4].set_ylabel(f"attitude σ, {unit}")
     axes[4].set_title(words, loc="right", fontsize="small")
     if total.max() > 5.0 * total[settled].max():  # a large initial σ would make the rest unreadable
-        log_scale(axes[4])
+        style.log_scale(axes[4])
         axes[4].set_ylim(bottom=0.4 * total.min() / size)  # a label below the curve
     else:
         axes[4].set_ylim(bottom=0.0)
@@ -152,14 +140,14 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         for name, block in estimate.error_states.items()
         for unit in dict.fromkeys(block.units)
     ]
-    figure, grid = new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
+    figure, grid = style.new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
     axes = np.atleast_1d(grid)
     settled = slice(len(estimate.time) // 10, None)
     for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
         word, size = error_state_unit(name, unit)
         values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
         for k, member in enumerate(members):
-            color = CYCLE[k % len(CYCLE)]
+            color = style.CYCLE[k % len(style.CYCLE)]
             low, high = values[:, k] - spread[:, k], values[:, k] + spread[:, k]
             if len(members) == 1:
                 band(ax, estimate.time, low, high, color=color, alpha=0.18)
@@ -173,7 +161,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         ax.set_ylabel(word)
         what = name.replace("scale", "misalignment") if (word, size) == ("mrad", 1e-3) else name
         ax.set_title(what, loc="left")
-        legend_above(ax, ncols=min(len(members), 9))
+        style.legend_above(ax, ncols=min(len(members), 9))
     axes[-1].set_xlabel("time, s")
     axes[-1].set_xlim(estimate.time[0], estimate.time[-1])
     figure.suptitle("; ".join([*([title] if title else []), f"dotted or shaded: {THREE_SIGMA}"]))
@@ -181,21 +169,9 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
 
 
 def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray | None = None) -> Figure:
-    """Draw the errors of an estimate relative to a reference about the axes of the fixed frame, with the filter's ±3σ.
+    """Draw the errors of an estimate relative to a reference q_fb (n, 4), heading above, the two of the vertical below, with its ±3σ.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Attitude with its covariance, or its variance about the body axes.
-    reference : ndarray (n, 4)
-        Reference q_fb at the times of the estimate; rows of NaN are unknown.
-    movement : ndarray (n,) of bool, optional
-        Samples that are judged, shaded.
-
-    Returns
-    -------
-    Figure
-        Heading error above, the two errors of the vertical below: a rotation vector in the fixed frame, from estimate to reference.
+    They are a rotation vector in the fixed frame, from estimate to reference; ``movement`` (n,) are the samples that are judged, shaded.
     """
     known = np.asarray(np.isfinite(reference).all(axis=1))
     error = np.full((len(known), 3), np.nan)
@@ -205,13 +181,13 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
         sigma = np.sqrt(np.einsum("nij,nj->ni", turn**2, estimate.variance[:, :3]))
     else:
         sigma = np.sqrt(np.einsum("nij,njk,nik->ni", turn, estimate.covariance[:, :3, :3], turn))
-    figure, axes = new_figure(3, 1, size=(9.0, 6.6), sharex=True)
+    figure, axes = style.new_figure(3, 1, size=(9.0, 6.6), sharex=True)
     mask = np.zeros(len(known), int) if movement is None else movement.astype(int)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
     for ax, axis, name in zip(axes, (2, 0, 1), ("heading", "vertical, about x", "vertical, about y"), strict=True):
         for k, (first, last) in enumerate(edges.reshape(-1, 2)):
             words = "movement (judged)" if k == 0 else None
-            ax.axvspan(*estimate.time[[first, last - 1]], color=ink(), alpha=0.07, linewidth=0, label=words)
+            ax.axvspan(*estimate.time[[first, last - 1]], color=style.ink(), alpha=0.07, linewidth=0, label=words)
         errors_in_envelope(estimate.time, error[None, :, axis] / DEGREE, sigma[:, axis] / DEGREE, ax)
         settled = slice(len(known) // 20, None)
         largest = np.nanmax(np.abs(error[settled, axis]), initial=0.0)
@@ -221,7 +197,7 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
         if ax is not axes[-1]:
             ax.set_xlabel("")
     figure.suptitle("Error relative to the reference, axes of the fixed frame")
-    legend_below(figure, axes, ncols=4)
+    style.legend_below(figure, axes, ncols=4)
     return figure
 
 
@@ -242,7 +218,7 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     Figure
         Attitude errors as a rotation vector in body axes, ``q_true = q_est ⊗ exp(δθ)``.
     """
-    figure, axes = new_figure(3, 2, size=(10.0, 6.6), sharex=True)
+    figure, axes = style.new_figure(3, 2, size=(10.0, 6.6), sharex=True)
     error = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     settled = slice(len(estimate.time) // 20, None)
     for column, (what, unit_of) in enumerate((("attitude", angle_unit), ("bias", rate_unit))):
@@ -254,11 +230,11 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
             errors_in_envelope(estimate.time, error[None, :, state] / size, estimate.sigma[:, state] / size, ax)
             reach = max(4.0 * estimate.sigma[settled, state].max(), 1.2 * np.abs(error[settled, state]).max()) / size
             ax.set_ylim(-reach, reach)
-            ax.set_ylabel(f"{what} {AXES[k]}, {unit}")
+            ax.set_ylabel(f"{what} {style.AXES[k]}, {unit}")
             if k < 2:
                 ax.set_xlabel("")
     axes[0, 0].set_title("Attitude error, rotation vector in body axes")
     axes[0, 1].set_title("Gyro bias error, body axes")
-    legend_below(figure, [axes[0, 0]])
+    style.legend_below(figure, [axes[0, 0]])
     figure.suptitle(f"{title}{': e' if title else 'E'}rrors against the truth")
     return figure

@@ -15,17 +15,7 @@ from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import COVERED, judged_epochs
-from strapdown.plots.style import (
-    AXES,
-    CYCLE,
-    VERMILION,
-    axes_or_new,
-    ink,
-    layered,
-    legend_above,
-    legend_below,
-    new_figure,
-)
+from strapdown.plots import style
 from strapdown.units import angle_unit, rate_unit
 
 BOUNDS = "bounds of a consistent filter"
@@ -65,11 +55,11 @@ def nees_over_time(
     Axes
         The axes.
     """
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     column = ("state", "attitude", "bias").index(subset)
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label=label)
+    ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label=label)
     for k, (name, statistics) in enumerate(named):
-        ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
+        ax.plot(statistics.time, statistics.anees[:, column], label=name, **style.layered(k, len(named)))
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter(_Plain())
     ax.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2.0, 0.5)))
@@ -99,26 +89,26 @@ def nis_over_time(
     Axes
         The axes.
     """
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):
         seen = statistics.nis_degrees > 0
-        ax.plot(statistics.nis_time[seen], statistics.nis[seen], label=name, **layered(k, len(named)))
+        ax.plot(statistics.nis_time[seen], statistics.nis[seen], label=name, **style.layered(k, len(named)))
     first = named[0][1]
     typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
     words = label or f"{100 * probability:g} % bounds, each interval"
-    ax.axhspan(*mean_bounds(1, typical, probability), color=ink(), alpha=0.12, linewidth=0, label=words)
+    ax.axhspan(*mean_bounds(1, typical, probability), color=style.ink(), alpha=0.12, linewidth=0, label=words)
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
     return ax
 
 
-STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXES)
+STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in style.AXES)
 """Names of the six states of the error (δθ, δb)."""
 
 
 def runs_overview(statistics: Statistics) -> Figure:
     """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the tested epochs."""
-    figure, axes = new_figure(1, 3, size=(10.5, 4.2))
+    figure, axes = style.new_figure(1, 3, size=(10.5, 4.2))
     axes[1].set_visible(statistics.has_bias)
     findings = statistics.judge().findings
     judged = judged_epochs(len(statistics.time) - 1)
@@ -128,13 +118,13 @@ def runs_overview(statistics: Statistics) -> Figure:
         bounds = next((one.low, one.high) for one in findings if (one.name, one.of) == ("ANEES", subset))
         nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
         anees = statistics.anees[judged, ("state", "attitude", "bias").index(subset)]
-        ax.plot(statistics.time[judged], anees, ".", color=CYCLE[0], label="epochs judged")
+        ax.plot(statistics.time[judged], anees, ".", color=style.CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
     if statistics.sensor_degrees.sum() > 0:
         nis_over_time([("all runs", statistics)], axes[2])
     else:
         axes[2].set_visible(False)
-    legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
+    style.legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
     return figure
 
 
@@ -147,24 +137,24 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
     """Draw the fraction of the runs within 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a consistent filter."""
     from scipy.stats import binom
 
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     runs = int(statistics.finite[epoch])
     for k, expected in enumerate(COVERED):
         low, high = binom.ppf([0.005, 0.995], runs, expected) / runs
-        ax.axhspan(100 * low, 100 * high, color=CYCLE[k], alpha=0.2, linewidth=0)
+        ax.axhspan(100 * low, 100 * high, color=style.CYCLE[k], alpha=0.2, linewidth=0)
         ax.plot(
             range(6),
             100 * statistics.covered[epoch, :, k],
             "o",
-            color=CYCLE[k],
+            color=style.CYCLE[k],
             label=f"within {k + 1}σ, expected {100 * expected:.1f} %",
         )
     ax.set_xticks(range(6), STATES, rotation=20)
     ax.grid(visible=False, axis="x")
-    ax.plot([], [], color=ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
+    ax.plot([], [], color=style.ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
     ax.set_ylim(0.0, 104.0)
     ax.set_ylabel(f"fraction of {runs} runs, %")
-    legend_above(ax, ncols=2)
+    style.legend_above(ax, ncols=2)
     return ax
 
 
@@ -172,7 +162,7 @@ def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0
     """Draw the 95 % ellipses of the errors of two states: by the filter's covariance, and of the actual errors."""
     from scipy.stats import chi2
 
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     i, j = pair
     largest = np.sqrt(max(claimed[i, i], found[i, i])), np.sqrt(max(claimed[j, j], found[j, j]))
     alike = i // 3 == j // 3  # two angles, or two rates: the same unit
@@ -182,10 +172,10 @@ def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0
     scale = np.array([size_i, size_j])
     reach = float(np.sqrt(chi2.ppf(0.95, 2)))
     styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
-        ("filter", claimed, {"edgecolor": VERMILION, "linewidth": 2.0}),
-        ("actual errors", found, {"edgecolor": ink(), "linewidth": 1.2, "linestyle": "--"}),
+        ("filter", claimed, {"edgecolor": style.VERMILION, "linewidth": 2.0}),
+        ("actual errors", found, {"edgecolor": style.ink(), "linewidth": 1.2, "linestyle": "--"}),
     )
-    for name, matrix, style in styles:
+    for name, matrix, look in styles:
         P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)
         value, vector = np.linalg.eigh(P)
         ax.add_patch(
@@ -195,7 +185,7 @@ def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0
                 angle=float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0]))),
                 facecolor="none",
                 label=name,
-                **style,
+                **look,
             )
         )
     spread = 1.25 * reach * np.array(largest) / scale
@@ -204,5 +194,5 @@ def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0
     ax.set_xlabel(f"{STATES[i]} error, {unit_i}")
     ax.set_ylabel(f"{STATES[j]} error, {unit_j}")
     ax.set_title("95 % ellipses", loc="left")
-    legend_above(ax)
+    style.legend_above(ax)
     return ax

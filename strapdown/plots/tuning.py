@@ -10,17 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from strapdown.checks import Array
-from strapdown.plots.style import (
-    BLUE,
-    SKY,
-    VERMILION,
-    axes_or_new,
-    ink,
-    legend_above,
-    legend_below,
-    log_scale,
-    new_figure,
-)
+from strapdown.plots import style
 from strapdown.tuning import Comparison, Slices, Tuning
 
 TALLEST = 15.0
@@ -29,27 +19,27 @@ TALLEST = 15.0
 
 def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | None = None) -> Axes:
     """Draw twice the decrease of the log-likelihood along one parameter, with its interval and its previous value."""
-    ax = axes_or_new(ax)
+    ax = style.axes_or_new(ax)
     one = tuning.parameters[number]
     unit = one.unit
     values = slices.values[number] / unit.factor
-    ax.semilogx(values, slices.fallen[number], color=BLUE, linewidth=1.4)
+    ax.semilogx(values, slices.fallen[number], color=style.BLUE, linewidth=1.4)
     if not tuning.composite:
-        ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
+        ax.axhline(3.84, color=style.ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
     lower, upper = max(one.lower / unit.factor, values[0]), min(one.upper / unit.factor, values[-1])
     ax.axvspan(
         lower,
         upper,
-        color=SKY,
+        color=style.SKY,
         alpha=0.3,
         linewidth=0,
         label="95 % interval" if one.identified else "below the 95 % bound",
     )
-    ax.axvline(one.value / unit.factor, color=BLUE, linewidth=0.8, label="tuned")
+    ax.axvline(one.value / unit.factor, color=style.BLUE, linewidth=0.8, label="tuned")
     before = one.start / unit.factor
     drawn = values[0] <= before <= values[-1]
     if drawn:
-        ax.axvline(before, color=VERMILION, linewidth=1.0, linestyle="--", label="before")
+        ax.axvline(before, color=style.VERMILION, linewidth=1.0, linestyle="--", label="before")
     ax.set_xlim(values[0], values[-1])
     ax.xaxis.set_minor_formatter(NullFormatter())
     if values[-1] < 10.0 * values[0]:
@@ -69,7 +59,9 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
     number = len(tuning.parameters)
     columns = min(number, 4)
     rows = -(-number // columns)
-    figure, axes = new_figure(rows, columns, size=(1.0 + 3.0 * columns, 0.7 + 2.7 * rows), squeeze=False, sharey=True)
+    figure, axes = style.new_figure(
+        rows, columns, size=(1.0 + 3.0 * columns, 0.7 + 2.7 * rows), squeeze=False, sharey=True
+    )
     for k, ax in enumerate(axes.ravel()):
         if k >= number:
             ax.set_visible(False)
@@ -77,15 +69,15 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
         likelihood_slice(slices, tuning, k, ax)
         if k % columns == 0:
             ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
-    legend_below(figure, list(axes.ravel()), ncols=5)
+    style.legend_below(figure, list(axes.ravel()), ncols=5)
     return figure
 
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
     """Draw NIS, and NEES if there is a truth, on the held-out data before and after tuning, with the bounds of a consistent filter."""
-    both = (("before", comparison.before, VERMILION), ("after", comparison.after, BLUE))
+    both = (("before", comparison.before, style.VERMILION), ("after", comparison.after, style.BLUE))
     rows = len(comparison.after.courses)
-    figure, axes = new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
+    figure, axes = style.new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
     for number, (of, _, _, bounds) in enumerate(comparison.after.courses):
         courses = []
         for name, one, color in both:
@@ -98,20 +90,17 @@ def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
 
 
 def _course(
-    ax: Axes,
-    courses: Sequence[tuple[str, str, float, Array, Array]],
-    bounds: tuple[float, float],
-    label: str,
+    ax: Axes, courses: Sequence[tuple[str, str, float, Array, Array]], bounds: tuple[float, float], label: str
 ) -> None:
     """Draw means over intervals of time, whose expectation is 1 for a consistent filter, before and after tuning."""
     for name, color, mean, time, values in courses:
         there = np.isfinite(values)
         ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
+    ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
     seen = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
     if seen.max() > 5.0 or seen.min() < 0.2:
-        log_scale(ax)
+        style.log_scale(ax)
         label += " (log scale)"
-    ax.axhline(1.0, color=ink(), linewidth=0.6, linestyle=":")
+    ax.axhline(1.0, color=style.ink(), linewidth=0.6, linestyle=":")
     ax.set_ylabel(label)
-    legend_above(ax)
+    style.legend_above(ax)

@@ -1,12 +1,12 @@
 """Recordings of devices, read from and written to many formats, with clear errors for faulty files.
 
-A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
-estimates attitude from it.
+A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :func:`strapdown.read` and
+:func:`strapdown.write` read and write it, and :mod:`strapdown.ahrs` estimates attitude from it.
 
 Own HDF5 files have a digest, MCAP and Parquet checksums, which are verified: a changed bit is noticed. CSV, TUM, ULog, ROS 1 bags and
 SQLite have none: one changed bit of a sample is another sample.
 
-- ``formats``: The table of formats; :func:`read` by content, :func:`write` by file extension.
+- ``formats``: The table of formats, :data:`FORMATS`: reading by content, writing by file extension.
 - ``body_axes``: Axes and signs that differ from the package's: :func:`with_axes`.
 - ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
 - ``ros``: ROS bags.
@@ -14,7 +14,6 @@ SQLite have none: one changed bit of a sample is another sample.
 - ``telemetry``: Logs of cameras, flight controllers and phones.
 - ``trajectories``: Folders of EuRoC and TUM-VI, TUM trajectories as references.
 - ``broad``: BROAD HDF5.
-- ``estimates``: Estimates in files of all these kinds.
 - ``samples``: One sensor at rest, for the identification of its noise.
 """
 
@@ -30,15 +29,14 @@ from strapdown.recordings.formats import (
     estimate_format,
     format_of,
     from_record,
-    is_estimate,
-    is_record,
     not_held,
     read,
     write,
     writers,
 )
+from strapdown.recordings.recordfiles import is_record
 from strapdown.recordings.samples import GyroSamples, read_samples, samples_of
 from strapdown.recordings.trajectories import read_tum, with_reference
 from strapdown.records.recording import FORCE_UNITS, RATE_UNITS, TIME_UNITS, Recording, gaps, increments
 
-__all__ = ["FORMATS", "Attitudes", "GyroSamples", "Recording", "from_table", "read", "read_samples", "write"]
+__all__ = ["FORMATS", "Attitudes", "GyroSamples", "Recording"]

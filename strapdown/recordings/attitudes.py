@@ -3,7 +3,7 @@
 ``read_attitudes`` recognises formats by content:
 
 - results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
-- the reference of a BROAD trial, TUM trajectories (no covariance) and EuRoC's ground truth;
+- the reference of a recording (BROAD, EuRoC folder, Parquet), TUM trajectories (no covariance) and EuRoC's ground truth;
 - CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
 - ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
   ``QuaternionStamped``;
@@ -26,8 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, array, one_of
 from strapdown.files import reading
-from strapdown.recordings import bag_files, delimited, recordfiles, ros, trajectories, ulog
-from strapdown.recordings.broad import read_broad
+from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, Recording, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
@@ -121,24 +120,19 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
 
 
 def _read(file: Path, topic: str) -> Attitudes:
-    if bag_files.is_folder(file):
-        return _bag(file, topic)
-    reading.existing_file(file)
-    if reading.is_hdf5(file):
-        kind = reading.kind(file)
-        return _own(file, kind) if kind else _of_recording(read_broad(file))
-    with reading.opened(file) as stream:
-        head = stream.read(4096)
-    if head.startswith(bag_files.MAGICS):
+    found = formats.format_of(file).name
+    if found == "ROS bag":
         return _bag(file, topic)
     if topic:
         raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
-    if head.startswith(b"ULog"):
+    if found == "BROAD" and (kind := reading.kind(file)):
+        return _own(file, kind)
+    if found == "ULog":
         return _ulog(file)
-    if trajectories.is_tum(head + b"\n"):
+    if found == "TUM trajectory":
         stamps, q = trajectories.read_tum(file)
         return Attitudes(source=file.name, stamps_ns=stamps, attitude=q, remarks=("TUM trajectory: no covariance.",))
-    return _table(file)
+    return _table(file) if found == "CSV" else _of_recording(formats.read(file, gyro_alone=True))
 
 
 def _whole_ns(time: Array) -> NDArray[np.int64]:
@@ -263,7 +257,12 @@ def _table(path: Path) -> Attitudes:
         covariance = covariance[:, :3, :3]
     if covariance is not None and covariance.shape[1] == 3:
         bias = None  # its covariance is not given
-    _need_order(path.name, stamps[known])
+    back = np.diff(stamps[known]) <= 0
+    if back.any():
+        row = int(np.argmax(back)) + 2
+        raise InputError(
+            f"{path.name}: row {row} is not after the one before; sort the rows, or check the unit of time"
+        )
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[known],
@@ -309,14 +308,6 @@ def _unit(name: str, q: Array) -> Array:
     if bad.any():
         raise InputError(f"{name}: quaternion {int(np.argmax(bad)) + 1} has norm {length[np.argmax(bad)]:.4g}, not 1")
     return quaternion.normalize(q)
-
-
-def _need_order(name: str, stamps: NDArray[np.int64]) -> None:
-    back = np.diff(stamps) <= 0
-    if back.any():
-        raise InputError(
-            f"{name}: row {int(np.argmax(back)) + 2} is not after the one before; sort the rows, or check the unit of time"
-        )
 
 
 # -------------------------------------------------------------------------------------------------------------- bags

@@ -203,7 +203,8 @@ class _Scan:
             add(seconds * 10**9 + nanoseconds, content)
         elif kind == b"\x07":
             own = _ros1_fields(bytes(content))
-            name = _ros2_name(own[b"type"].decode())
+            package, _, kind_name = own[b"type"].decode().partition("/")
+            name = f"{package}/msg/{kind_name.removeprefix('msg/')}"  # as in ROS 2
             self.topic(_U32.unpack(fields[b"conn"])[0], re.sub("/+", "/", fields[b"topic"].decode()), name)
             self.bag.definitions[name] = own[b"message_definition"].decode(errors="replace")
 
@@ -345,11 +346,6 @@ def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
         fields[key] = value
         at = end
     return fields
-
-
-def _ros2_name(kind: str) -> str:
-    package, _, name = kind.partition("/")
-    return kind if name.startswith("msg/") else f"{package}/msg/{name}"
 
 
 def _mcap_records(data: memoryview, place: int) -> Iterator[tuple[int, int, memoryview]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown.checks import InputError, positive
+from strapdown.checks import Array, InputError, increasing, positive
 from strapdown.files import atomic_write, reading, whole_hdf5
 from strapdown.recordings import recordfiles
 from strapdown.records.recording import Recording, field_in, with_gyro
@@ -24,12 +24,12 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
     with reading.hdf5(path) as file:
         held = reading.attributes(file)
         kind = str(held.get("kind", ""))
-        if kind.startswith("strapdown ") and kind != recordfiles.KIND:
-            raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
         if kind == recordfiles.KIND:
             raise InputError(
                 f"{name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
             )
+        if kind.startswith("strapdown "):
+            raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
         missing = [key for key in ("imu_gyr",) if key not in file]
         if "sampling_rate" not in held:
             missing.append("the attribute sampling_rate")
@@ -58,22 +58,22 @@ EVEN = 1e-3
 """Maximum relative deviation of a sample interval from the mean, for the intervals to count as equal."""
 
 
-def sample_interval(recording: Recording) -> float:
-    """Return the interval between the stamps of a recording, s; if the intervals differ, the error names the worst."""
-    steps = np.diff(recording.time)
+def sample_interval(source: str, time: Array) -> float:
+    """Return the interval between the stamps (n,) of a recording, s; if the intervals differ, the error names the worst."""
+    steps = np.diff(increasing(f"{source}: time", time, minimum=2))
     mean = float(steps.mean())
     worst = int(np.argmax(np.abs(steps - mean)))
     if abs(steps[worst] - mean) > EVEN * mean:
         raise InputError(
-            f"{recording.source}: the interval after {recording.time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the "
-            "recording to a part with equal sample intervals"
+            f"{source}: the interval after {time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the recording to a part "
+            "with equal sample intervals"
         )
     return mean
 
 
 def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording with equal sample intervals in the layout of BROAD, which has no clock."""
-    interval = sample_interval(recording)
+    interval = sample_interval(recording.source, recording.time)
     known = recording.magnetic_field is not None and recording.magnetic_unit
     content = {
         "imu_gyr": recording.rate,

@@ -19,7 +19,8 @@ from strapdown.checks import Array, InputError, numbers
 from strapdown.files import atomic_write, reading
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
-from strapdown.recordings.delimited import recording_columns
+from strapdown.recordings.delimited import recording_columns, write_columns
+from strapdown.records import Estimate
 from strapdown.records.recording import CLOCK_OFFSET, Recording, relative_time
 
 
@@ -33,37 +34,7 @@ def from_table(
 ) -> Recording:
     """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
-    Parameters
-    ----------
-    table : DataFrame, Table, Dataset, structured array or mapping of str to array_like
-        Columns named as those of a CSV file, of pandas, polars, pyarrow or another library with ``__arrow_c_stream__``; arrays (n, 3) of a
-        mapping, a structured array or a Dataset hold x, y and z.
-    source : str, default "table"
-        Name of the recording, for messages.
-    units : mapping of str to str, optional
-        Units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
-    columns : mapping of str to str, optional
-        Names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are found by
-        their names.
-    gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units are then not needed.
-
-    Returns
-    -------
-    Recording
-        The recording.
-
-    Raises
-    ------
-    InputError
-        In the same cases as :func:`read` for a CSV file.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> rest = {"time": np.arange(3.0), "gyro [dps]": np.zeros((3, 3))}
-    >>> from_table(rest).rate.shape
-    (3, 3)
+    ``source`` is its name in messages; options as for :func:`strapdown.read`.
     """
     found = _columns(source, table)
     names, arrays = list(found), list(found.values())
@@ -181,7 +152,7 @@ def read_parquet(
     columns: Mapping[str, str] | None = None,
     gyro_alone: bool = False,
 ) -> Recording:
-    """Read a recording from Parquet; options as for :func:`strapdown.recordings.read`."""
+    """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     reading.existing_file(file)
@@ -228,3 +199,11 @@ def write_parquet_columns(
     with atomic_write(path) as temporary:
         table = arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
         parquet.write_table(table, temporary, write_page_checksum=True)
+
+
+def write_estimate(
+    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
+) -> None:
+    """Write an estimate as Parquet or text, by the suffix; options as for :meth:`strapdown.records.Estimate.table`."""
+    write = write_parquet_columns if Path(path).suffix.lower() == ".parquet" else write_columns
+    write(path, estimate.table(recording=recording, **options))

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from strapdown.checks import Array, InputError
 from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
-from strapdown.recordings import recordfiles
 from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"
@@ -47,13 +46,9 @@ def read_csv(
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
     left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
-    :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors are not needed.
+    :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     file = Path(path)
-    if recordfiles.is_record(file):
-        raise InputError(
-            f"{file.name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
-        )
     table = Table(file.name, io.StringIO(reading.text(file), newline=""))
     return naming.recording(
         file.name, table.header, table.load, table.clock_ns, units=units, mapping=columns, gyro_alone=gyro_alone
@@ -78,9 +73,10 @@ class Table:
             if len(row) == width + 1 and not row[-1].strip():
                 del row[-1]  # a separator at the end of the line
             if len(row) != width:
-                raise InputError(
-                    f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {_why(row, width)}"
-                )
+                numbers = width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row)
+                why = "the file is truncated or damaged there"
+                why = "it seems to have decimal commas: write points" if numbers else why
+                raise InputError(f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {why}")
             try:
                 result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
             except ValueError:
@@ -200,12 +196,6 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _why(row: Sequence[str], width: int) -> str:
-    if width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row):
-        return "it seems to have decimal commas: write points"
-    return "the file is truncated or damaged there"
 
 
 def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:

@@ -17,10 +17,10 @@ import numpy as np
 
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.recordings import bag_files, recordfiles, telemetry, trajectories
+from strapdown.recordings import bag_files, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord
-from strapdown.records.recording import Recording, with_gyro
+from strapdown.records.recording import Recording, matched, with_gyro
 
 HEAD = 4096
 """Number of bytes at the start of a file from which its format is recognised."""
@@ -92,7 +92,7 @@ FORMATS: tuple[Format, ...] = (
         read="dataframes:read_parquet",
         options=("units", "columns", "gyro_alone"),
         write="dataframes:write_parquet",
-        write_estimate="estimates:write_table",
+        write_estimate="dataframes:write_estimate",
         estimate_options=("sequence", "frame"),
     ),
     Format(
@@ -111,13 +111,13 @@ FORMATS: tuple[Format, ...] = (
         name="TUM trajectory",
         endings=(".tum",),
         recognised=lambda path, head: _text(head) and trajectories.is_tum(head),
-        write_estimate="estimates:write_tum",
+        write_estimate="trajectories:write_tum",
         estimate_options=("frame",),
     ),
     Format(
         name="BROAD",
         endings=(".hdf5", ".h5"),
-        recognised=_starts(b"\x89HDF\r\n\x1a\n"),
+        recognised=_starts(b"\x89HDF\r\n\x1a\n", reading.SEAL),
         read="broad:read_broad",
         write="broad:write_broad",
         lacks=("temperature", "clock"),
@@ -129,7 +129,7 @@ FORMATS: tuple[Format, ...] = (
         read="delimited:read_csv",
         options=("units", "columns", "gyro_alone"),
         write="delimited:write_csv",
-        write_estimate="estimates:write_table",
+        write_estimate="dataframes:write_estimate",
         estimate_options=("sequence", "frame"),
     ),
 )
@@ -180,41 +180,7 @@ def read(
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
 ) -> Recording:
-    """Read a recording of any format, recognised by its content.
-
-    Parameters
-    ----------
-    path : path-like
-        A file, or the folder of a ROS 2 bag or of EuRoC.
-    units : mapping of str to str, optional
-        For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
-    gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units are then not needed.
-    columns : mapping of str to str, optional
-        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
-        are found by their names.
-    topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, if there are several.
-    axes : str or mapping of str to str, optional
-        The recorded axes that become the body's x, y, z, for example ``"x,-y,-z"`` for a unit whose z axis points down; or those of
-        single sensors, ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
-    invert : str or iterable of str, default empty
-        Sensors with inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
-
-    Returns
-    -------
-    Recording
-        The recording; its ``remarks`` list the choices of the reader.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, of no known format, truncated before the first complete sample, or its units are unknown or undeclared.
-
-    Examples
-    --------
-    >>> walk = read("walk.csv", units={"gyro": "deg/s"})  # doctest: +SKIP
-    """
+    """Read a recording of any format, recognised by its content: a file, or a folder; options as for :func:`strapdown.read`."""
     file = Path(path)
     found = format_of(file)
     if not found.read:
@@ -222,25 +188,21 @@ def read(
             f"{file.name} is a {found.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
     given = {"units": units or {}, "columns": columns or {}, "topic": topic}
+    needed = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}
     for name, value in given.items():
+        if value and name not in found.options and name in needed:
+            raise InputError(f"{file.name} ({found.name}): {needed[name]}; drop the option")
         if value and name not in found.options:
-            _refuse_option(file, found, name, value)
+            said = found.name if found.name != "BROAD" else "HDF5"
+            raise InputError(
+                f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
+            )
     options: dict[str, Any] = {name: value for name, value in given.items() if name in found.options}
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
     with reading.from_file(file, found.name):
         recording: Recording = _function(found.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
-
-
-def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
-    if name == "units":
-        said = found.name if found.name != "BROAD" else "HDF5"
-        raise InputError(
-            f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
-        )
-    what = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}[name]
-    raise InputError(f"{file.name} ({found.name}): {what}; drop the option")
 
 
 def write(
@@ -252,22 +214,8 @@ def write(
 ) -> None:
     """Write a recording or an estimate in the format of the file extension; the file is created only when complete.
 
-    Parameters
-    ----------
-    content : Recording, ImuRecord or Estimate
-        Data to write. A simulated record is written as the recording of a device.
-    path : path-like
-        File: ``.csv``, ``.tsv``, ``.parquet``, ``.h5``, ``.bag``, ``.mcap`` …
-    recording : Recording, optional
-        With an estimate: the recording that it was made from, whose samples are written if the format supports them (a ROS bag needs
-        it).
-    **options : dict
-        Options of the format's writer.
-
-    Raises
-    ------
-    InputError
-        If no format of that extension can store such content, or the content lacks data that the format needs.
+    A simulated record is written as the recording of a device. ``recording`` is that from which an estimate was made, whose samples are
+    written if the format supports them (a ROS bag needs it); ``options`` are those of the format's writer.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")
@@ -318,18 +266,17 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     interval. Series of kind "vector" named accelerometer and magnetometer are included, at the stamps where they have samples; the truth is
     the reference.
     """
-    steps = record.intervals[:, None]
     own: dict[str, Any] = {}
     left_out = []
+    simulated = record.origin is not None and record.origin.scenario is not None
     for series in record.vectors:
         field = {"accelerometer": "specific_force", "magnetometer": "magnetic_field"}.get(series.sensor)
         if field is not None and series.kind == "vector":
-            values = np.full((len(record.increments), 3), np.nan)
-            places = np.searchsorted(record.time[1:], series.time - 1e-9)
-            same = places < len(values)
-            same[same] &= np.abs(record.time[1:][places[same]] - series.time[same]) < 1e-9
-            values[places[same]] = series.vector_b[same]
-            own[field] = values
+            own[field] = np.full((len(record.increments), 3), np.nan)
+            rows, same = matched(record.time[1:], series.time, 1e-9)
+            own[field][rows[same]] = series.vector_b[same]
+            if simulated and field == "magnetic_field":
+                own["magnetic_unit"] = "T"
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
     words = (
@@ -338,7 +285,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     return with_gyro(
         source=source,
         time=record.time[1:],
-        rate=record.increments / steps,
+        rate=record.rates,
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
         temperature=None if record.temperature is None else record.temperature[1:],
         remarks=(words,) if left_out else (),
@@ -349,13 +296,3 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
 def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Return the contents of a recording that the format of a path's extension cannot store."""
     return _by_ending(path, "write").lacks
-
-
-def is_estimate(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is an estimate of this package in HDF5."""
-    return Path(path).is_file() and reading.kind(path) == "strapdown estimate"
-
-
-def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is a simulated record (:mod:`strapdown.recordings.recordfiles`); a folder is not."""
-    return not Path(path).is_dir() and recordfiles.is_record(path)

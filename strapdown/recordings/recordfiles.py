@@ -7,7 +7,6 @@ conventions and version.
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 from collections.abc import Mapping
@@ -130,29 +129,6 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
     return {name: value for name, value in made.items() if value is not None}
 
 
-class _FiledOrigin(Origin):
-    """The origin from a file; its scenario is read on first access, because one with a gyro preset takes half a second."""
-
-    def __init__(self, text: str, path: str | os.PathLike[str], made: Mapping[str, Any]) -> None:
-        """Store the TOML; if there is no specification of the gyro, that of the scenario is used."""
-        super().__init__(**made)
-        vars(self).pop("scenario")
-        vars(self).update(_text=text, _path=path)
-        if self.gyro is None:
-            vars(self).update(gyro=self.scenario.gyro)
-
-    @functools.cached_property
-    def scenario(self) -> Any:  # type: ignore[override]
-        """The scenario."""
-        from strapdown.scenarios import scenario_from_toml  # imported late, because it imports every motion
-
-        with reading.from_file(self._path):
-            return scenario_from_toml(self._text, f"{self._path}: scenario")
-
-    _text: str
-    _path: str | os.PathLike[str]
-
-
 def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, source: str = "") -> Origin | None:
     """Return the origin in the attributes of a file, as from :func:`origin_attributes`; None if there is nothing of it.
 
@@ -165,11 +141,14 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
         made["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")
     if made or attributes.keys() & {"scenario", "source"}:
         made["source"] = str(attributes.get("source", source))
-    if "scenario" not in attributes:
-        return Origin(**made) if made else None
-    if not isinstance(attributes["scenario"], str):
-        raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
-    return _FiledOrigin(attributes["scenario"], path, made)
+    if "scenario" in attributes:
+        from strapdown.scenarios import scenario_from_toml  # imported late, because it imports every motion
+
+        if not isinstance(attributes["scenario"], str):
+            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
+        made["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
+        made.setdefault("gyro", made["scenario"].gyro)
+    return Origin(**made) if made else None
 
 
 def _values(group: Any, name: str, unit: str) -> Array:

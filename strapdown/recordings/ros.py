@@ -31,7 +31,7 @@ from strapdown.checks import Array, Hint, InputError, one_of
 from strapdown.files.extras import library
 from strapdown.recordings.bag_files import Add, Bag, Data, write_checksums
 from strapdown.records import Estimate
-from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, matched, relative_time, with_gyro
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",
@@ -145,9 +145,8 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         if not isinstance(other, Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
             continue
         other_stamps, other_values, words = other.decoded(file.name)
-        places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[
-            kind
-        ]  # in ROS, w is last in a quaternion
+        # In ROS, w is last in a quaternion.
+        places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]
         own[name], lost = at_nearest(time, (other_stamps - epoch) / 1e9, other_values[:, places])
         said += [
             f"Topic {other.name}: {len(other_stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
@@ -327,8 +326,7 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
 
 def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> None:
     """Write an estimate's attitude and covariance into the messages at its stamps."""
-    places = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
-    same = np.abs(recording.time[places] - estimate.time) < 1e-6
+    places, same = matched(recording.time, estimate.time, 1e-6)
     if not same.any():
         raise InputError(
             f"{recording.source} and the estimate have no stamp in common; give the recording that the estimate was made from"
@@ -351,9 +349,8 @@ def _encoded(stamps: NDArray[np.int64], numbers: Array, ros2: bool) -> NDArray[n
     begin += -(begin - 4) % 8 if ros2 else 0
     table = np.zeros((len(stamps), begin + 8 * numbers.shape[1]), np.uint8)
     words = np.zeros((len(stamps), 4), "<u4")
-    words[:, 0] = (
-        256 if ros2 else np.arange(len(stamps))
-    )  # 00 01 00 00: little-endian CDR; in ROS 1 the sequence number of the header
+    # 00 01 00 00: little-endian CDR; in ROS 1 the sequence number of the header.
+    words[:, 0] = 256 if ros2 else np.arange(len(stamps))
     words[:, 1], words[:, 2], words[:, 3] = stamps // 10**9, stamps % 10**9, len(frame)
     table[:, :16] = words.view(np.uint8)
     table[:, 16 : 16 + len(frame)] = np.frombuffer(frame, np.uint8)

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -58,36 +57,26 @@ def read_samples(
 ) -> GyroSamples:
     """Read one sensor of a recording of any format, the gyro of a simulated record, or a NPY array (n,) or (n, 3).
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor.
-    rate : float, optional
-        Sample rate, Hz; only for an NPY array.
-    units : mapping of str to str, optional
-        Units as in :func:`strapdown.recordings.read`; for an NPY array by the name of the sensor.
-    columns : mapping of str to str, optional
-        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
-        are found by their names.
-    topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, if there are several.
-    gaps : bool, default False
-        Whether gaps are allowed: samples are then placed on a grid, and missing ones are NaN.
-
-    Returns
-    -------
-    GyroSamples
-        Samples at equal intervals.
-
-    Raises
-    ------
-    InputError
-        If the sensor is missing, its unit is unknown, or its sample intervals are unequal.
+    ``rate``, Hz, is only for an array, whose unit is ``units[sensor]``; other options as for :func:`strapdown.read`. ``gaps``: whether gaps
+    are allowed: samples are then placed on a grid, and missing ones are NaN.
     """
-    file = Path(path)
-    samples = _samples(file, one_of("sensor", sensor, SENSORS), rate, dict(units or {}), columns, topic, gaps)
+    file, given = Path(path), dict(units or {})
+    one_of("sensor", sensor, SENSORS)
+    if file.suffix.lower() == ".npy":
+        reading.existing_file(file)
+        with reading.from_file(file):
+            samples = _read_array(file, sensor, rate, given)
+    elif rate is not None:
+        raise InputError(f"{file.name} states its own rate; drop the option rate")
+    elif recordfiles.is_record(file):
+        if given:
+            raise InputError(
+                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
+            )
+        samples = samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
+    else:
+        recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
+        samples = samples_of(recording, sensor, gaps=gaps)
     largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
     if samples.values.shape[1] not in (1, 3):
         raise InputError(
@@ -106,25 +95,6 @@ LARGEST = 1e12
 """Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
 
 
-def _samples(
-    file: Path, sensor: str, rate: float | None, given: dict[str, str], columns: Any, topic: str, gaps: bool
-) -> GyroSamples:
-    if file.suffix.lower() == ".npy":
-        reading.existing_file(file)
-        with reading.from_file(file):
-            return _read_array(file, sensor, rate, given)
-    if rate is not None:
-        raise InputError(f"{file.name} states its own rate; drop the option rate")
-    if not file.is_dir() and file.exists() and recordfiles.is_record(file):
-        if given:
-            raise InputError(
-                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
-            )
-        return samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
-    recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
-    return samples_of(recording, sensor, gaps=gaps)
-
-
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
@@ -133,7 +103,7 @@ def samples_of(
     if isinstance(content, Recording):
         return _of_recording(content, sensor, gaps)
     if sensor == "gyro":
-        interval = sample_interval(Recording(source=source, time=content.time[1:], rate=content.increments))
+        interval = sample_interval(source, content.time[1:])
         temperature = None if content.temperature is None else content.temperature[1:]
         return GyroSamples(
             values=content.increments, sample_interval=interval, kind="increments", temperature=temperature
@@ -167,9 +137,8 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     time, samples = recording.time[known], values[known]
     temperature = None if recording.temperature is None else temperature_at_samples(recording)[known]
     remarks = recording.remarks
-    own = Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3)))
     try:
-        interval = sample_interval(own)
+        interval = sample_interval(recording.source, time)
     except InputError:
         if not gaps:
             raise

@@ -75,7 +75,8 @@ def find(recording: Recording) -> Faults:
     measured = recording.rate
     step = truncation_step(measured)
     if step is not None:
-        changes["rate"] = measured = untruncated(measured, step)
+        # Less to those within a step of zero, which are interpolated.
+        changes["rate"] = measured = measured + 0.5 * np.clip(measured, -step, step)
         words.append(
             f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half a step is added to each"
         )
@@ -189,11 +190,6 @@ def _quantisation(rate: Array) -> float | None:
     if np.sum(number[on]) < 0.8 * np.sum(number) or len(frequent) > 0.1 * np.sum(number):
         return None
     return float(np.sum((slow * number)[on]) / np.sum((np.rint(multiple) * number)[on]))
-
-
-def untruncated(rate: Array, step: float) -> Array:
-    """Return rates with half a step added away from zero; less to those within a step of zero, which are interpolated."""
-    return np.asarray(rate + 0.5 * np.clip(rate, -step, step))
 
 
 def clipped_samples(samples: Array, least: float) -> np.ndarray:

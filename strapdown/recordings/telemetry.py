@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
-from strapdown.files.extras import library, with_ending
+from strapdown.files.extras import library
 from strapdown.records.recording import Recording, with_gyro
 from strapdown.units import DEGREE
 
@@ -42,7 +42,11 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
     reading.existing_file(file)
     with tempfile.TemporaryDirectory() as folder:
-        found = parser.Parser(str(with_ending(file, _ending(file), Path(folder))))
+        named, ending = file, _ending(file)
+        if file.suffix.lower() != ending:  # a link with the extension that the library requires
+            named = Path(folder) / f"{file.stem}{ending}"
+            named.symlink_to(file.absolute())
+        found = parser.Parser(str(named))
         rows: list[dict[str, Any]] = found.normalized_imu()
     if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
         raise InputError(

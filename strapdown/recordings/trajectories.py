@@ -14,10 +14,9 @@ stamps on both sides are at most :data:`strapdown.records.recording.BRIDGED` apa
 
 from __future__ import annotations
 
-import math
 import os
-import re
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +24,9 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError
-from strapdown.files import reading
+from strapdown.files import atomic_write, reading
 from strapdown.recordings.delimited import is_number, read_csv
+from strapdown.records import Estimate
 from strapdown.records.recording import Recording, interpolated
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
@@ -52,84 +52,61 @@ def read_euroc(path: str | os.PathLike[str]) -> Recording:
     truth = next((root / name / "data.csv" for name in TRUTHS if (root / name / "data.csv").is_file()), None)
     if truth is None:
         return recording
-    stamps, attitude = _read_truth(truth)
-    return _with_reference(recording, stamps, attitude, f"{truth.parent.name}/data.csv")
-
-
-def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps, ns, and quaternions, scalar first, of an EuRoC ground truth."""
-    rows = _rows(path, ",")
-    if rows and len(rows[0]) < 8:
-        raise InputError(f"{path} has {len(rows[0])} columns; wanted time, position and quaternion, 8 or more")
-    return _whole(path, [row[0] for row in rows], 1), np.array([[float(x) for x in row[4:8]] for row in rows])
+    stamps, rows = _table(truth, ",", 1)
+    if rows.shape[1] < 8:
+        raise InputError(f"{truth} has {rows.shape[1]} columns; wanted time, position and quaternion, 8 or more")
+    return _with_reference(recording, stamps, rows[:, 4:8], f"{truth.parent.name}/data.csv")
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     """Read stamps (n,), ns, and unit quaternions (n, 4), scalar first, of a TUM trajectory."""
     file = Path(path)
-    rows = _rows(file, None)
-    for k, row in enumerate(rows):
-        if len(row) != 8:
-            raise InputError(
-                f"{file.name}: data row {k + 1} has {len(row)} numbers; a TUM trajectory has time tx ty tz qx qy qz qw"
-            )
-    q = np.array([[float(x) for x in row[4:]] for row in rows])[:, [3, 0, 1, 2]]
-    if np.any(np.linalg.norm(q, axis=1) < 0.5):
+    stamps, rows = _table(file, None, 10**9)
+    if rows.shape[1] != 8:
         raise InputError(
-            f"{file.name}: data row {int(np.argmin(np.linalg.norm(q, axis=1))) + 1} has a quaternion of norm below 0.5; it must be 1"
+            f"{file.name}: data row 1 has {rows.shape[1]} numbers; a TUM trajectory has time tx ty tz qx qy qz qw"
         )
-    return _whole(file, [row[0] for row in rows], 10**9), quaternion.normalize(q)
+    norm = np.linalg.norm(rows[:, 4:], axis=1)
+    if np.any(norm < 0.5):
+        raise InputError(
+            f"{file.name}: data row {int(np.argmin(norm)) + 1} has a quaternion of norm below 0.5; it must be 1"
+        )
+    return stamps, quaternion.normalize(rows[:, [7, 4, 5, 6]])
 
 
 def is_tum(head: bytes) -> bool:
     """Return whether a text begins like a TUM trajectory: rows of eight numbers separated by blanks."""
-    lines = [
-        line.split()
-        for line in head.decode("utf-8", "ignore").splitlines()[:-1]
-        if line.strip() and not line.startswith("#")
-    ]
-    if not lines:
-        return False
-    return all(len(line) == 8 and all(map(is_number, line)) for line in lines)
+    whole = head.decode("utf-8", "ignore").rpartition("\n")[0].splitlines()
+    rows = [line.split() for line in whole if line.strip() and not line.startswith("#")]
+    return bool(rows) and all(len(row) == 8 and all(map(is_number, row)) for row in rows)
 
 
-def _rows(path: Path, separator: str | None) -> list[list[str]]:
+def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int64], Array]:
+    """Return the times (n,) of a table without header, the first column in units of ``tick`` ns, in whole ns, and all columns (n, k).
+
+    Times are read as decimal numbers, because seconds since 1970 have more digits than a float.
+    """
     lines = reading.text(path).splitlines()
-    rows = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    for k, row in enumerate(rows):
-        try:
-            [float(x) for x in row]
-        except ValueError:
-            raise InputError(f"{path.name}: data row {k + 1} is not numeric: {' '.join(row)[:60]!r}") from None
-        if len(row) != len(rows[0]):
-            raise InputError(
-                f"{path.name}: data row {k + 1} has {len(row)} fields, the first {len(rows[0])}; the file is truncated there"
-            )
-    if not rows:
+    cells = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not cells:
         raise InputError(f"{path.name} has no data rows")
-    return rows
-
-
-def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
-    """Return stamps in integer ns without rounding: seconds since 1970 have more digits than a float."""
-    stamps = np.empty(len(cells), np.int64)
-    for k, cell in enumerate(cells):
-        whole, _, part = cell.partition(".")
-        if re.fullmatch("-?[0-9]{1,19}", whole) and re.fullmatch("[0-9]*", part):
-            digits = int((part + "0" * 9)[:9]) if factor > 1 else 0
-            stamp = int(whole) * factor + (-digits if whole.startswith("-") else digits)
-        else:
-            number = float(cell) * factor
-            stamp = round(number) if math.isfinite(number) else 2**63
-        if abs(stamp) >= 2**63:
-            raise InputError(
-                f"{path.name}: data row {k + 1}: the time is {cell}, which no clock counts; remove the row"
-            )
-        stamps[k] = stamp
-    back = np.diff(stamps) <= 0
-    if back.any():
-        raise InputError(f"{path.name}: data row {int(np.argmax(back)) + 2} is not after the one before; sort the rows")
-    return stamps
+    rows: list[list[float]] = []
+    stamps: list[int] = []
+    for k, row in enumerate(cells):
+        place = f"{path.name}: data row {k + 1}"
+        try:
+            rows.append([float(x) for x in row])
+        except ValueError:
+            raise InputError(f"{place} is not numeric: {' '.join(row)[:60]!r}") from None
+        if len(row) != len(cells[0]):
+            raise InputError(f"{place} has {len(row)} fields, the first {len(cells[0])}; the file is truncated there")
+        stamp = Decimal(row[0])
+        if not stamp.is_finite() or abs(stamp) >= 2**63 // tick:
+            raise InputError(f"{place}: the time is {row[0]}, which no clock counts; remove the row")
+        stamps.append(int(stamp * tick))
+        if k and stamps[-1] <= stamps[-2]:
+            raise InputError(f"{place} is not after the one before; sort the rows")
+    return np.array(stamps, np.int64), np.array(rows)
 
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
@@ -150,3 +127,17 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
         )
     words = f"Reference of {name}: at {known} of {len(found)} stamps."
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
+
+
+def write_tum(
+    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, frame: str = "ENU"
+) -> None:
+    """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
+    found = estimate.table(frame=frame)
+    q = np.stack([found[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
+    stamps = np.rint(estimate.time * 1e9).astype(np.int64) + (0 if recording is None else recording.epoch_ns)
+    with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write("# time tx ty tz qx qy qz qw\n")
+        for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
+            sign, size = "-" if stamp < 0 else "", abs(stamp)
+            file.write(f"{sign}{size // 10**9}.{size % 10**9:09d} 0 0 0 {' '.join(map(repr, row))}\n")

@@ -15,4 +15,4 @@ from strapdown.records.record import LARGEST_TURN, ImuRecord, Origin, Truth, com
 from strapdown.records.recording import Recording
 from strapdown.records.result_files import CONVENTIONS, put, read_attributes, result_file, write_attitude
 
-__all__ = ["ErrorStateEstimate", "Estimate", "Event", "ImuRecord", "Innovations", "Origin", "Truth", "compress", "cut"]
+__all__ = ["ErrorStateEstimate", "Estimate", "Event", "ImuRecord", "Innovations", "Origin", "Truth", "compress"]

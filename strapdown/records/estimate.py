@@ -22,6 +22,7 @@ from strapdown.checks import (
     symmetric,
     unit_quaternions,
 )
+from strapdown.files.extras import library
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
@@ -465,11 +466,6 @@ class Estimate(ByValue, Listed):
             ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
             ``free_acceleration_*_m_per_s2``. If full covariances were stored, ``cov_body_xx_rad2`` … of the body-side error,
             with ``b`` before an axis for the bias.
-
-        Raises
-        ------
-        InputError
-            If a time of the estimate is not a stamp of the recording.
         """
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance
@@ -480,7 +476,9 @@ class Estimate(ByValue, Listed):
         found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         assert angles.sigma is not None
-        for k, name in enumerate(_angle_names(sequence)):
+        axes = sequence.upper()
+        for k, axis in enumerate(axes):
+            name = _NAMES[axis] if len(set(axes)) == 3 else f"angle_{k + 1}_{axis.lower()}"
             found[f"{name}_deg"] = angles.angles[:, k] / DEGREE
             found[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
         north = outputs.heading(self.attitude, P)
@@ -518,22 +516,9 @@ class Estimate(ByValue, Listed):
         pandas.DataFrame
             One row per time.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise InputError("a DataFrame needs pandas; pip install 'strapdown[formats]'") from None
-        return pandas.DataFrame(self.table(**options))
+        return library("pandas", "a DataFrame").DataFrame(self.table(**options))
 
 
 _NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 """Names of the angles of a sequence of three different axes."""
 _STATES = ("x", "y", "z", "bx", "by", "bz")
-
-
-def _angle_names(sequence: str) -> list[str]:
-    axes = sequence.upper()
-    return (
-        [_NAMES[axis] for axis in axes]
-        if len(set(axes)) == 3
-        else [f"angle_{k + 1}_{axis.lower()}" for k, axis in enumerate(axes)]
-    )

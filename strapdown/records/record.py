@@ -214,11 +214,6 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
     ImuRecord
         Record of n // N intervals; remaining intervals at the end are dropped.
 
-    Raises
-    ------
-    InputError
-        If the record has fewer than N intervals.
-
     Notes
     -----
     The rotation vector is the increment of the longer interval: with the coning correction, a filter may treat it as a rotation at
@@ -235,20 +230,7 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
 
 
 def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
-    """Return the part of the record between two edges, with the measurements in (t_first, t_last].
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Record of n intervals.
-    first, last : int
-        Indices of the edges, 0 ≤ first < last ≤ n.
-
-    Returns
-    -------
-    ImuRecord
-        The part. A part from edge 0 includes the measurements at that edge.
-    """
+    """Return the part of the record between two edges, with the measurements in (t_first, t_last], from edge 0 also those at that edge."""
     if not 0 <= first < last < len(record.time):
         raise InputError(
             f"cut from edge {first} to {last} of a record with edges 0 to {len(record.time) - 1}; choose 0 ≤ first < last"

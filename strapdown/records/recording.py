@@ -185,20 +185,14 @@ class Recording(Listed):
         -------
         ndarray (m,) of int
             Rows.
-
-        Raises
-        ------
-        InputError
-            If a time is not a stamp of the recording.
         """
-        rows = np.clip(np.searchsorted(self.time, time - 1e-7), 0, len(self.time) - 1)
-        off = np.abs(self.time[rows] - time)
-        if off.max() > 1e-6:
-            k = int(np.argmax(off))
+        rows, same = matched(self.time, time, 1e-6)
+        if not same.all():
+            missing = time[np.argmin(same)]
             raise InputError(
-                f"{self.source} has no stamp {time[k]:.6g} s, which the estimate has; give the recording that it was made from"
+                f"{self.source} has no stamp {missing:.6g} s, which the estimate has; give the recording that it was made from"
             )
-        return np.asarray(rows)
+        return rows
 
     @property
     def clock_ns(self) -> NDArray[np.int64]:
@@ -271,6 +265,12 @@ def relative_time(clock_ns: NDArray[np.int64]) -> tuple[Array, int]:
     """
     epoch = int(clock_ns[0]) if len(clock_ns) and abs(int(clock_ns[0])) > CLOCK_OFFSET * 1e9 else 0
     return np.asarray((clock_ns - epoch) / 1e9), epoch
+
+
+def matched(stamps: Array, time: Array, tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return for each time (m,) the row of the same stamp in ``stamps`` (n,), and whether there is one within a tolerance, s."""
+    rows = np.minimum(np.searchsorted(stamps, time - tolerance), len(stamps) - 1)
+    return rows, np.abs(stamps[rows] - time) <= tolerance
 
 
 def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:

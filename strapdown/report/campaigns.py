@@ -14,7 +14,8 @@ from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.report import findings, page
+from strapdown.report import page
+from strapdown.results import Table
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -27,10 +28,9 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     judgement = workflows.check(held)
     bound = verdicts.bound_of(held.plan)
     numbers = verdicts.summary(statistics, bound=bound)
+    ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
-    parts = [
-        part for one in verdicts.tables(numbers) for part in (page.paragraph(f"{one.title}:"), *findings.tabled(one))
-    ]
+    parts = [page.paragraph(f"{one.title}:") + "\n" + page.table(one) for one in verdicts.tables(numbers)]
     failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
@@ -38,23 +38,18 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         f"Monte Carlo: {name}",
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
-        findings.verdict(judgement),
+        page.judged(judgement),
         page.section("Key numbers", *parts, *failed),
-        findings.evidence(judgement),
+        page.section("Evidence", page.table(judgement.listing())),
         page.section("Over time", *_over_time(statistics, judgement)),
-        page.section(
-            "At the end",
-            page.figure(
-                lambda: _end(statistics),
-                "σ-coverage by state, and the covariance of the errors and of the filter",
-            ),
-        ),
+        page.section("At the end", page.figure(lambda: _end(statistics), ending)),
         _worst(statistics, path),
         page.section(
             "Provenance",
             page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
         ),
     )
+    estimated = len(_estimated(statistics))
     table = {
         "source": path.name,
         "judgement": judgement.summary(),
@@ -62,9 +57,13 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         "failed_runs": statistics.failed,
         "time_s": statistics.time,
         "anees": {name: statistics.anees[:, SUBSETS[name][0]] for name in statistics.subsets},
-        "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))],
-        "sigma_si": statistics.sigma[:, : len(_estimated(statistics))],
-        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _over_bound(statistics, bound)}),
+        "rms_error_si": statistics.rms_error[:, :estimated],
+        "sigma_si": statistics.sigma[:, :estimated],
+        **(
+            {}
+            if bound is None
+            else {"rms_over_root_cramer_rao_bound": verdicts.efficiency(statistics, bound)[:, :estimated]}
+        ),
         "nis_by_sensor": dict(zip(statistics.sensors, statistics.sensor_nis, strict=True)),
         "worst_runs": statistics.worst_run,
     }
@@ -74,11 +73,6 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
 def _estimated(statistics: Statistics) -> tuple[str, ...]:
     """Return the names of the states that the filter estimates."""
     return STATES if statistics.has_bias else STATES[:3]
-
-
-def _over_bound(statistics: Statistics, bound: Array) -> Array:
-    """Return the RMS error divided by the root of the Cramér–Rao bound, by epoch and estimated state."""
-    return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
 
 
 def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:
@@ -117,18 +111,9 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
 
 def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
     """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
-    low, high = (np.full(len(time), bound) for bound in bounds)
-    band = (
-        page.Series(label="upper bound", value=high, colour="--faint", band=True),
-        page.Series(label="lower bound", value=low, colour="--faint", band=True),
-    )
-    return page.chart(
-        title,
-        "per degree of freedom",
-        time,
-        (*band, *lines),
-        log=bool(max(np.nanmax(one.value) for one in lines) > 4.0),
-    )
+    band = page.band(np.full(len(time), bounds[0]), np.full(len(time), bounds[1]))
+    log = bool(max(np.nanmax(one.value) for one in lines) > 4.0)
+    return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
 
 
 def _end(statistics: Statistics) -> Figure:
@@ -143,13 +128,11 @@ def _end(statistics: Statistics) -> Figure:
 
 
 def _worst(statistics: Statistics, path: Path) -> str:
-    rows = [
-        (str(run), page.number(float(score)))
-        for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
-    ]
+    rows = list(zip(statistics.worst_run, statistics.worst_score, strict=True))
+    head = ("run", "maximum NEES of the state (6 degrees of freedom)")
     return page.section(
         "Worst runs",
-        page.table(("run", "maximum NEES of the state (6 degrees of freedom)"), rows, numbers=2),
+        page.table(Table("", head, rows, left=0)),
         page.paragraph("A run can be repeated by its number, bit for bit, with its record and estimate:"),
         page.code(f'run = sd.montecarlo.replay(sd.read("{path.name}").plan, {int(statistics.worst_run[0])})'),
     )

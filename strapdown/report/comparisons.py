@@ -15,9 +15,8 @@ from strapdown.plots.style import AXES
 from strapdown.records import Estimate
 from strapdown.records.recording import interpolated
 from strapdown.report import page
+from strapdown.results import Table
 from strapdown.units import DEGREE, angle_unit, rate_unit
-
-_COLOURS = ("--a", "--b", "--c")
 
 
 def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
@@ -81,7 +80,7 @@ def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str],
             "angle, °",
             time,
             [
-                page.Series(label=name, value=angles[:, k], colour=_COLOURS[j], wraps=True, dash=j == 1)
+                page.Series(label=name, value=angles[:, k], colour=page.COLOURS[j], wraps=True, dash=j == 1)
                 for j, (name, angles) in enumerate(zip(names, euler, strict=True))
             ],
         )
@@ -98,13 +97,9 @@ def _differences(
     charts = []
     for k, axis in enumerate(AXES):
         first, second = (3.0 * sigma[:, k] / size for sigma in sigmas)
-        series = (
-            page.Series(label=f"+3σ of {names[0]}", value=first, colour="--faint", band=True),
-            page.Series(label="−3σ", value=-first, colour="--faint", band=True),
-            page.Series(label=f"+3σ of {names[1]}", value=second, colour="--b", dash=True),
-            page.Series(label="−3σ ", value=-second, colour="--b", dash=True),
-            page.Series(label="difference, second minus first", value=difference[:, k] / size, colour="--a"),
-        )
+        series = page.band(-first, first, (f"+3σ of {names[0]}", "−3σ"))
+        series += page.band(-second, second, (f"+3σ of {names[1]}", "−3σ "), colour="--b", dash=True)
+        series.append(page.Series(label="difference, second minus first", value=difference[:, k] / size))
         reach = 1.3 * max(float(np.abs(one[settled]).max()) for one in (first, second, difference[:, k] / size))
         title, label = f"{what} {axis}, difference", f"{what.lower()} {axis}, {unit}"
         charts.append(page.chart(title, label, time, series, reach=reach))
@@ -117,7 +112,7 @@ def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tu
     for error, attitude in zip(errors, attitudes, strict=True):
         error[known] = quaternion.angle_between(attitude[known], truth[known]) / DEGREE
     series = [
-        page.Series(label=name, value=error, colour=_COLOURS[j], dash=j == 1)
+        page.Series(label=name, value=error, colour=page.COLOURS[j], dash=j == 1)
         for j, (name, error) in enumerate(zip(names, errors, strict=True))
     ]
     return [page.chart("Total attitude error relative to the truth", "error, °", time, series)]
@@ -125,12 +120,12 @@ def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tu
 
 def _numbers(difference: Array, angle: Array, sigmas: tuple[Array, Array], names: tuple[str, str]) -> str:
     unit, size = angle_unit(np.sqrt(np.mean(difference**2, axis=0)))
-    rms = lambda x: page.number(float(np.sqrt(np.mean(x**2)) / size))  # noqa: E731
+    rms = lambda x: np.sqrt(np.mean(x**2)) / size  # noqa: E731
     named = [(axis, difference[:, k], [sigma[:, k] for sigma in sigmas]) for k, axis in enumerate(AXES)]
     named.append(("total", angle, [np.linalg.norm(sigma[:, :3], axis=1) for sigma in sigmas]))
     rows = [
-        (f"{name}, {unit}", rms(value), page.number(float(np.abs(value).max() / size)), *map(rms, spreads))
+        (f"{name}, {unit}", rms(value), np.abs(value).max() / size, *map(rms, spreads))
         for name, value, spreads in named
     ]
     head = ("attitude", "RMS difference", "largest", *(f"σ of {name}" for name in names))
-    return page.table(head, rows, numbers=4)
+    return page.table(Table("", head, rows))

@@ -15,10 +15,8 @@ from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
-from strapdown.report import findings, page
+from strapdown.report import page
 from strapdown.units import DEGREE, angle_unit, rate_unit
-
-_COLOURS = ("--a", "--b", "--c")
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -44,10 +42,10 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
         f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
         f"strapdown {attributes.get('version', '')}",
-        findings.verdict(judgement),
-        findings.listed(estimate.listing()),
-        *([] if table is None else [findings.listed(table.listing())]),
-        findings.evidence(judgement),
+        page.judged(judgement),
+        page.listed(estimate.listing()),
+        *([] if table is None else [page.listed(table.listing())]),
+        page.section("Evidence", page.table(judgement.listing())),
         _over_time(estimate, truth, error),
         *[_sensor(name, one) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
@@ -84,28 +82,25 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
             for k, axis in enumerate(AXES):
                 state = states.start + k
                 bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
-                series: tuple[page.Series, ...] = (
-                    page.Series(label="+3σ (99.7 %)", value=bound, colour="--faint", band=True),
-                    page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
-                )[: 2 * known]
-                series += (page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),)
+                series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) if known else []
+                series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=page.COLOURS[k]))
                 reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
-        series = tuple(
-            page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
+        series = [
+            page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
             for k, name in enumerate(angle_labels(estimate.fixed_frame))
-        )
+        ]
         charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
-        series = tuple(
-            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)
-        )
+        series = [
+            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
+        ]
         charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
-        series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
+        series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
         charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
     return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
 

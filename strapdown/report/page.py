@@ -7,13 +7,12 @@ import html
 import importlib.resources
 import io
 import json
-import math
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,12 +23,20 @@ from strapdown.files import reading
 from strapdown.plots import style
 from strapdown.plots.decimation import extreme_rows
 from strapdown.plots.estimates import wraps
+from strapdown.results import Table
+
+if TYPE_CHECKING:
+    from strapdown.consistency import Judgement
 
 CHART_SAMPLES = 200_000
 """Maximum number of times of an interactive chart; longer series are reduced to the extremes of each column."""
 _DOTS_PER_INCH = 120
 _WIDE = 7.0
 """Width in inches above which a figure scrolls on a narrow page instead of shrinking."""
+
+
+COLOURS = ("--a", "--b", "--c")
+"""Colours of the lines of three axes or of several results, by their names in page.css."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,6 +56,14 @@ class Series:
     """Whether the line is dashed."""
 
 
+def band(
+    low: Array, high: Array, labels: tuple[str, str] = ("upper bound", "lower bound"), **look: Any
+) -> list[Series]:
+    """Return the series of a band, by default filled, from its limits; ``labels`` are those of the upper and the lower one."""
+    look = look or {"colour": "--faint", "band": True}
+    return [Series(label=label, value=value, **look) for label, value in zip(labels, (high, low), strict=True)]
+
+
 def text(content: Any) -> str:
     """Return text escaped for HTML."""
     return html.escape(str(content))
@@ -56,11 +71,8 @@ def text(content: Any) -> str:
 
 def section(title: str, *parts: str) -> str:
     """Return a section with a heading."""
-    return f'<section id="{_anchor(title)}"><h2>{text(title)}</h2>\n' + "\n".join(parts) + "</section>\n"
-
-
-def _anchor(title: str) -> str:
-    return re.sub(r"\W+", "-", title.lower()).strip("-")
+    anchor = re.sub(r"\W+", "-", title.lower()).strip("-")
+    return f'<section id="{anchor}"><h2>{text(title)}</h2>\n' + "\n".join(parts) + "</section>\n"
 
 
 def _contents(parts: Sequence[str]) -> str:
@@ -84,30 +96,23 @@ MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
 """Classes of cells by their text."""
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[str] = ()) -> str:
-    """Return a table, which scrolls horizontally on a narrow page.
-
-    The last ``numbers`` columns contain numbers and are right-aligned; a table without numbers wraps its text instead of scrolling.
-    ``marked`` is the class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
-    """
-    plain = len(head) - numbers
-    heads = [f"<th{' class=number' if j >= plain else ''}>{text(cell)}</th>" for j, cell in enumerate(head)]
-    lines = ["<tr>" + "".join(heads) + "</tr>"]
-    for k, row in enumerate(rows):
-        cells = []
-        for j, cell in enumerate(row):
-            mark = MARKS.get(cell, "") or (marked[k] if j == 0 and k < len(marked) else "")
-            kind = f' class="{mark}"' if mark else ' class="number"' if j >= plain else ""
-            cells.append(f"<td{kind}>{text(cell)}</td>")
-        lines.append("<tr>" + "".join(cells) + "</tr>")
-    kind = "scroll" if numbers else "wrap"
-    focus = ' tabindex="0"' if numbers else ""  # so that the arrow keys scroll it
-    return f'<div class="{kind}"{focus}><table>' + "\n".join(lines) + "</table></div>"
+def table(content: Table) -> str:
+    """Return a table and its notes, without its title; it scrolls on a narrow page, or without numbers wraps its text."""
+    kinds = [' class="number"' if k >= content.left else "" for k in range(len(content.head))]
+    heads = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
+    lines = [f"<tr>{heads}</tr>"]
+    for row in content.cells:
+        own = [f' class="{MARKS[cell]}"' if cell in MARKS else kind for kind, cell in zip(kinds, row, strict=True)]
+        cells = "".join(f"<td{kind}>{text(cell)}</td>" for kind, cell in zip(own, row, strict=True))
+        lines.append(f"<tr>{cells}</tr>")
+    frame = 'class="scroll" tabindex="0"' if any(kinds) else 'class="wrap"'  # the arrow keys scroll what has the focus
+    notes = (paragraph(note, faint=True) for note in content.notes)
+    return "\n".join([f"<div {frame}><table>" + "\n".join(lines) + "</table></div>", *notes])
 
 
-def number(value: float, digits: int = 4) -> str:
-    """Return a number as text; empty for NaN."""
-    return "" if math.isnan(value) else f"{value:.{digits}g}"
+def listed(content: Table) -> str:
+    """Return the section of a table."""
+    return section(content.title, table(content))
 
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
@@ -165,29 +170,10 @@ def chart(
     log: bool = False,
     log_x: bool = False,
 ) -> str:
-    """Return an interactive chart with its data, all samples as 16-bit numbers, compressed.
+    """Return an interactive chart over ``time`` (n,), increasing, with its data, all samples as 16-bit numbers, compressed.
 
-    Parameters
-    ----------
-    title, unit : str
-        Heading, and label of the vertical axis.
-    time : ndarray (n,)
-        Horizontal axis, increasing.
-    series : sequence of Series
-        Lines; a band is two successive series.
-    reach : float, optional
-        The vertical axis is ±``reach`` at first. Default: the range of the data.
-    x : str
-        Label of the horizontal axis.
-    ticks : sequence of str
-        Names of the values 0, 1, … of the horizontal axis, if it has no numbers; lines are then drawn as points.
-    log, log_x : bool
-        Whether the vertical, the horizontal axis is logarithmic.
-
-    Returns
-    -------
-    str
-        HTML.
+    ``unit`` and ``x`` are the labels of the axes. The vertical axis is ±``reach`` at first; None: the range of the data. ``ticks`` are the
+    names of 0, 1, … on the horizontal axis, if it has no numbers; lines are then drawn as points.
     """
     lines = [one.value for one in series if not one.band]
     rows = np.arange(len(time))
@@ -258,11 +244,7 @@ def packed_time(time: Array) -> dict[str, Any]:
     least = float(intervals[intervals > 0.0].min(initial=1.0))
     tick = max(min(1e-6, 1e-3 * least), float(intervals.max(initial=0.0)) / 2.0**30)
     ticks = np.rint((time - time[0]) / tick).astype(np.int64)
-    return {
-        "first": float(time[0]),
-        "tick": tick,
-        "deflate": _compressed(np.diff(ticks, prepend=0).astype(np.int32)),
-    }
+    return {"first": float(time[0]), "tick": tick, "deflate": _compressed(np.diff(ticks, prepend=0).astype(np.int32))}
 
 
 def _compressed(integers: NDArray[Any]) -> str:
@@ -278,6 +260,12 @@ def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
     listing = f"<ul>{items}</ul>" if items else ""
     said = f"{reason[:1].upper()}{reason[1:]}{'' if reason.endswith('.') else '.'}"
     return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(said)}{listing}</div>'
+
+
+def judged(judgement: Judgement) -> str:
+    """Return the verdict box of a judgement."""
+    found = [finding.means for finding in judgement.findings if finding.rejected]
+    return verdict(judgement.verdict, judgement.reason, found)
 
 
 def page(title: str, subtitle: str, *parts: str) -> str:
@@ -308,6 +296,6 @@ def provenance(attributes: Mapping[str, Any]) -> str:
             f"{value:.6g}" if isinstance(value, float) else str(value.decode() if isinstance(value, bytes) else value)
         )
         (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
-    parts = [table(("attribute", "value"), short)] if short else []
+    parts = [table(Table("", ("attribute", "value"), short, left=2))] if short else []
     parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]
     return "\n".join(parts)

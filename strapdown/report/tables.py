@@ -32,13 +32,12 @@ def to_csv(table: Table) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(table.keys)
-    writer.writerows([["" if _empty(cell) else _no_formula(cell) for cell in row.values()] for row in table.records])
+    for row in table.records:
+        cells = ("" if _empty(cell) else cell for cell in row.values())
+        # Text that a spreadsheet would run as a formula behind an apostrophe: names may come from a file of someone else.
+        formulas = ("=", "+", "-", "@", "\t", "\r")
+        writer.writerow([f"'{x}" if isinstance(x, str) and x.startswith(formulas) else x for x in cells])
     return stream.getvalue()
-
-
-def _no_formula(cell: Value) -> Value:
-    """Return a cell, text that a spreadsheet would run as a formula behind an apostrophe: names may come from a file of someone else."""
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
 
 
 def to_latex(table: Table) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from strapdown.checks import InputError, one_of
 from strapdown.files import reading
 from strapdown.plots.tuning import TALLEST
-from strapdown.report import findings, page
+from strapdown.report import page
 from strapdown.results import Table
 from strapdown.tuning.fitting import VERDICTS
 
@@ -53,7 +53,7 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
         texts += [text for one in tables for row in ([one.title], one.columns, one.notes, *one.rows) for text in row]
         if not all(isinstance(text, str) for text in texts) or not all(isinstance(one.left, int) for one in tables):
             raise TypeError("what is no text")
-        listed = [findings.listed(one) for one in tables]
+        listed = [page.listed(one) for one in tables]
         charts = {}
         if "slices" in content:  # of the command
             charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
@@ -72,14 +72,10 @@ def _over_time(held: dict[str, Any]) -> list[str]:
     for before, after in zip(*(held[name].get("over_time", []) for name in ("before", "after")), strict=True):
         time, (low, high) = np.array(after["time_s"]), after["bounds"]
         means = [np.array(one["mean"], float) for one in (before, after)]
-        series = [
-            page.Series(
-                label="99 % bounds, each interval", value=np.full(len(time), high), colour="--faint", band=True
-            ),
-            page.Series(label="lower bound", value=np.full(len(time), low), colour="--faint", band=True),
-            page.Series(label="before", value=means[0], colour="--b", dash=True),
-            page.Series(label="after", value=means[1]),
-        ]
+        bounds = (np.full(len(time), low), np.full(len(time), high))
+        series = page.band(*bounds, ("99 % bounds, each interval", "lower bound"))
+        series.append(page.Series(label="before", value=means[0], colour="--b", dash=True))
+        series.append(page.Series(label="after", value=means[1]))
         wide = np.nanmax(means) > 5.0 or np.nanmin(means) < 0.2
         charts.append(page.chart(after["of"], "mean over the interval", time, series, log=bool(wide)))
     return charts
@@ -103,8 +99,9 @@ def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
     line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
     within = (x >= low) & (x <= high)
     series = [
-        page.Series(label="95 % interval", value=np.where(within, TALLEST, np.nan), colour="--faint", band=True),
-        page.Series(label="its lower limit", value=np.where(within, 0.0, np.nan), colour="--faint", band=True),
+        *page.band(
+            np.where(within, 0.0, np.nan), np.where(within, TALLEST, np.nan), ("95 % interval", "its lower limit")
+        ),
         page.Series(label="−2 Δ log likelihood", value=np.where(fallen <= TALLEST, fallen, np.nan)),
         page.Series(label="tuned", value=line(value), colour="--c"),
         page.Series(label="before", value=line(before), colour="--b", dash=True),

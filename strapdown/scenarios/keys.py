@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import inspect
-import itertools
 import json
 import math
 import re
-import textwrap
 import typing
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -90,39 +86,22 @@ class Section:
 
 
 def sections() -> list[Section]:
-    """Return every table of a scenario file.
-
-    Returns
-    -------
-    list of Section
-        Tables in the order of a file, one for each type of motion and of sensor.
-    """
+    """Return every table of a scenario file, in its order, one for each type of motion and of sensor."""
     said = _meanings(Scenario)
     names = (_text(name, said.get(name, "")) for name in ("name", "description"))
     keys = (*names, *_keys(Scenario, toml.TOP_FORM))
     top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
-    warm = Section(
-        group="gyro",
-        header="[temperature]",
-        summary=_summary(Temperature),
-        keys=_keys(Temperature, toml.TEMPERATURE),
-    )
-    return [top, *_motions(), _gyro(), warm, *_sensors()]
+    warm = _section("gyro", "[temperature]", Temperature, _keys(Temperature, toml.TEMPERATURE))
+    sensors = [
+        _section("sensors", "[[sensors]]", kind, (*_keys(kind, form), *_keys(vectors.Faults, faults)), word)
+        for word, (kind, form, faults) in toml.SENSORS.items()
+    ]
+    path = _section("sensors", "[sensors.orbit]", orbit.CircularOrbit, _keys(orbit.CircularOrbit, toml.ORBIT))
+    return [top, *_motions(), _gyro(), warm, *sensors, path]
 
 
 def named(name: str) -> list[Section]:
-    """Return the tables of a group, ``top``, ``motion``, ``gyro`` or ``sensors``, or those of one ``type``, such as "coning".
-
-    Parameters
-    ----------
-    name : str
-        Group, type, or header of a table.
-
-    Returns
-    -------
-    list of Section
-        Its tables.
-    """
+    """Return the tables of a group, ``top``, ``motion``, ``gyro`` or ``sensors``, or those of one type, such as "coning", or header."""
     every = sections()
     found = [one for one in every if name in (one.group, one.type, one.header, one.header.strip("[]"))]
     if not found:
@@ -143,18 +122,7 @@ def listing(section: Section) -> Table:
 
 
 def example(section: Section) -> str:
-    """Return a table as in a scenario file: its required keys, and the others as comments with their default.
-
-    Parameters
-    ----------
-    section : Section
-        One of :func:`sections`.
-
-    Returns
-    -------
-    str
-        TOML.
-    """
+    """Return a table as in a scenario file, TOML: its required keys, and the others as comments with their default."""
     lines = [] if section.group == "top" else [section.header]
     if section.type:
         lines.append(f'type = "{section.type}"')
@@ -167,27 +135,30 @@ def example(section: Section) -> str:
 # ---------------------------------------------------------------------------------------------------------------- the tables
 
 
-def _motions() -> list[Section]:
-    def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
-        return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
+def _section(group: Any, header: str, subject: Any, keys: tuple[Key, ...], word: str = "", more: str = "") -> Section:
+    """Return a section whose summary is the first paragraph about a class or function."""
+    text = " ".join((inspect.getdoc(subject) or "").split("\n\n")[0].split())
+    summary = text.replace("``", "`").removeprefix("Return ") + more
+    return Section(group=group, header=header, type=word, summary=summary, keys=keys)
 
+
+def _motions() -> list[Section]:
     lists: dict[str, dict[str, Any]] = {  # of a sampled motion
         "time_s": {"type": "list of numbers", "example": [0.4 * k for k in range(6)]},
         "attitudes": {"type": "list of quaternions", "example": [[1.0, 0.0, 0.0, 0.0]] * 6},
     }
-
-    def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
-        return tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
-
-    found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in toml.MOTIONS.items()]
-    harmonic = _keys(motion.Harmonic, toml.HARMONIC)
+    found = []
+    for word, (kind, form) in toml.MOTIONS.items():
+        keys = tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
+        found.append(_section("motion", "[motion]", kind, keys, word))
     start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
     parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."
+    harmonic, each = _keys(motion.Harmonic, toml.HARMONIC), " One such table for each."
     return [
         *found,
-        section("", motion.Harmonic, harmonic, " One such table for each.", "[[motion.harmonics]]"),
-        section("rest", motion.rest, start),
-        section("composed", motion.Composed, (), parts),
+        _section("motion", "[[motion.harmonics]]", motion.Harmonic, harmonic, more=each),
+        _section("motion", "[motion]", motion.rest, start, "rest"),
+        _section("motion", "[motion]", motion.Composed, (), "composed", parts),
     ]
 
 
@@ -201,17 +172,6 @@ def _gyro() -> Section:
         "writes it to `gyro-temperature.toml`."
     )
     return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
-
-
-def _sensors() -> list[Section]:
-    def section(word: str, subject: Any, keys: tuple[Key, ...], header: str = "[[sensors]]") -> Section:
-        return Section(group="sensors", header=header, type=word, summary=_summary(subject), keys=keys)
-
-    found = [
-        section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, faults)))
-        for word, (kind, form, faults) in toml.SENSORS.items()
-    ]
-    return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, toml.ORBIT), "[sensors.orbit]")]
 
 
 # ------------------------------------------------------------------------------------------------------- from the dataclasses
@@ -275,31 +235,14 @@ def _toml(value: Any) -> str:
     return f"`{value!r}`".replace("'", '"') if isinstance(value, str) else str(value)
 
 
-def _summary(subject: Any) -> str:
-    text = " ".join((inspect.getdoc(subject) or "").split("\n\n")[0].split())
-    return text.replace("``", "`").removeprefix("Return ")
-
-
 @functools.cache
 def _meanings(kind: type) -> dict[str, str]:
-    """Return what is said of each field: in the string below it, or in the section Parameters or Attributes of the class."""
-    said = dict(_documented(inspect.getdoc(kind) or ""))
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
-    for statement, below in itertools.pairwise(body):
-        if (
-            isinstance(statement, ast.AnnAssign)
-            and isinstance(below, ast.Expr)
-            and isinstance(below.value, ast.Constant)
-            and isinstance(below.value.value, str)
-        ):
-            said[ast.unparse(statement.target)] = below.value.value
-    said = {name: re.sub(r":\w+:`", "`", text) for name, text in said.items()}
-    return {name: " ".join(text.split()).replace("``", "`").replace("|", "\\|") for name, text in said.items()}
-
-
-def _documented(text: str) -> Iterator[tuple[str, str]]:
-    """Yield name and description of each entry of the sections Parameters and Attributes of a docstring."""
-    for part in re.findall(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S+\n-+\n|\Z)", text, re.M | re.S):
-        for names, description in re.findall(r"^(\S[^:\n]*?) ?:.*\n((?:[ \n].*\n?)*)", part + "\n", re.M):
-            for name in names.split(","):
-                yield name.strip(), " ".join(description.split())
+    """Return what the sections Parameters and Attributes of the docstring of a class say of each field."""
+    said: dict[str, str] = {}
+    for part in re.findall(
+        r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S+\n-+\n|\Z)", inspect.getdoc(kind) or "", re.M | re.S
+    ):
+        for names, text in re.findall(r"^(\S[^:\n]*?) ?:.*\n((?:[ \n].*\n?)*)", part + "\n", re.M):
+            plain = " ".join(re.sub(r":\w+:`", "`", text).split()).replace("``", "`").replace("|", "\\|")
+            said |= {name.strip(): plain for name in names.split(",")}
+    return said

@@ -61,11 +61,7 @@ MOTIONS: dict[str, tuple[type, Form]] = {
 """Motions by their ``type`` in a file, in addition to "rest" and "composed" (tables ``base`` and ``vibration``)."""
 
 HARMONIC: Form = {"amplitude": tables.DEGREES_PER_SECOND, "frequency": tables.HERTZ, "phase": tables.DEGREES}
-ORBIT: Form = {
-    "altitude": (("km", 1e3), ("m", 1.0)),
-    "inclination": tables.DEGREES,
-    "phase": tables.DEGREES,
-}
+ORBIT: Form = {"altitude": (("km", 1e3), ("m", 1.0)), "inclination": tables.DEGREES, "phase": tables.DEGREES}
 
 _OF_SENSORS: dict[str, tables.Choice] = {
     **dict.fromkeys(("name", "kind"), tables.TEXT),

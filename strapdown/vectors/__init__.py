@@ -4,31 +4,23 @@ Every sensor has its own rate, phase and :class:`Faults` (latency, outages, outl
 :class:`VectorMeasurements`: body-frame measurements ``q⁻¹ r q + v`` of vectors known in the fixed frame, or of the attitude itself. The
 series has the *nominal* noise only: outliers, correlation, hard iron and acceleration are not disclosed to the filter.
 
-- ``measurements``: A series of measurements, its kinds and its noise.
+- ``measurements``: A series of measurements, its kinds and its noise; unit vectors about a reference, ``triad``.
 - ``sensor``: What all sensors have in common: times, noise, faults.
 - ``vector_sensor``, ``horizon_sensor``, ``attitude_sensor``, ``magnetometer``, ``accelerometer``, ``heading_pair``: One sensor each.
-- ``triads``: Right-handed unit vectors about a reference.
 - ``wahba``: Attitude from two or more vectors by least squares (Wahba's problem), with its covariance.
 """
 
 from __future__ import annotations
 
-from strapdown.vectors import wahba as wahba
-from strapdown.vectors.accelerometer import GRAVITY_F as GRAVITY_F
-from strapdown.vectors.accelerometer import Accelerometer as Accelerometer
-from strapdown.vectors.accelerometer import specific_force as specific_force
-from strapdown.vectors.attitude_sensor import AttitudeSensor as AttitudeSensor
-from strapdown.vectors.heading_pair import HeadingPair as HeadingPair
-from strapdown.vectors.horizon_sensor import HorizonSensor as HorizonSensor
-from strapdown.vectors.magnetometer import Magnetometer as Magnetometer
-from strapdown.vectors.measurements import KINDS as KINDS
-from strapdown.vectors.measurements import VectorMeasurements as VectorMeasurements
-from strapdown.vectors.measurements import need_level as need_level
-from strapdown.vectors.measurements import need_unit as need_unit
-from strapdown.vectors.sensor import Faults as Faults
-from strapdown.vectors.sensor import Sensor as Sensor
-from strapdown.vectors.triads import triad as triad
-from strapdown.vectors.vector_sensor import VectorSensor as VectorSensor
+from strapdown.vectors import wahba
+from strapdown.vectors.accelerometer import GRAVITY_F, Accelerometer, specific_force
+from strapdown.vectors.attitude_sensor import AttitudeSensor
+from strapdown.vectors.heading_pair import HeadingPair
+from strapdown.vectors.horizon_sensor import HorizonSensor
+from strapdown.vectors.magnetometer import Magnetometer
+from strapdown.vectors.measurements import KINDS, VectorMeasurements, need_level, need_unit, triad
+from strapdown.vectors.sensor import Faults, Sensor
+from strapdown.vectors.vector_sensor import VectorSensor
 
 __all__ = [
     "Accelerometer",

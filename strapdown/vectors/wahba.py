@@ -19,12 +19,7 @@ from strapdown.checks import Array, InputError, array, place
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
-__all__ = [
-    "InconsistentError",
-    "Solution",
-    "from_vertical_and_heading",
-    "solve",
-]
+__all__ = ["InconsistentError", "Solution", "from_vertical_and_heading", "solve"]
 
 INCONSISTENT = 6.0
 """Maximum error of the angle between two measured directions, σ; correct data exceed it in two of 1e9 pairs."""

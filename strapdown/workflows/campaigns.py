@@ -7,17 +7,15 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from strapdown import (
-    scenarios,
-)
+from strapdown import scenarios
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.scenarios import Scenario
+from strapdown.workflows.filters import filter_for_scenario, need_alone
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Dispersions, Plan, Statistics
-from strapdown.workflows.filters import filter_for_scenario, need_alone
 
 
 def plan(

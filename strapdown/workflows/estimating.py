@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import (
-    ahrs,
-    quaternion,
-    records,
-    units,
-)
+from strapdown import ahrs, quaternion, records, units
 from strapdown.ahrs.remarks import fixed_frame, remarks
 from strapdown.checks import Hint, InputError, array, count, instance
 from strapdown.estimation import setup as setups
@@ -25,12 +20,12 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
+from strapdown.workflows.filters import filter_for_record, specification_of, with_gyro_noise
 
 if TYPE_CHECKING:
     from strapdown.allan import NoiseFit
     from strapdown.calibration import UnitCalibration
     from strapdown.gyro.temperature import BiasOverTemperature
-from strapdown.workflows.filters import filter_for_record, specification_of, with_gyro_noise
 
 SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
 

@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strapdown import (
-    recordings,
-    scenarios,
-)
+from strapdown import recordings, scenarios
 from strapdown.checks import Hint, InputError, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
@@ -40,6 +37,7 @@ def read(
     topic: str = "",
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
+    gyro_alone: bool = False,
 ) -> ImuRecord | Recording | Estimate | Campaign:
     """Read a file of any known format, identified by its content, or a table in memory.
 
@@ -47,18 +45,22 @@ def read(
     ----------
     path : path, DataFrame, Dataset or mapping
         A simulated record, an estimate or a Monte Carlo of this package, or a recording in a format of
-        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording, as for
-        :func:`strapdown.recordings.from_table` (pandas, polars, pyarrow, xarray, structured arrays, arrays by name).
+        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording named as in a CSV file:
+        of pandas, polars, pyarrow, xarray, a structured array, or arrays by name, of which arrays (n, 3) hold x, y and z.
     units : mapping of str to str, optional
         For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
     columns : mapping of str to str, optional
-        For tables: names of columns by role, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``.
+        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        are found by their names.
     topic : str, default ""
         For bags and flight logs: topic of the inertial unit, if there are several.
     axes : str or mapping of str to str, optional
-        For recordings: the recorded axes that become the body's x, y, z (:func:`strapdown.recordings.read`).
+        For recordings: the recorded axes that become the body's x, y, z, for example ``"x,-y,-z"`` for a unit whose z axis points down;
+        or those of single sensors, ``{"magnetometer": "y,x,-z"}``.
     invert : str or iterable of str, default empty
-        For recordings: sensors with inverted sign.
+        For recordings: sensors with inverted sign, ``"accelerometer"`` for one that reads −g upward at rest.
+    gyro_alone : bool, default False
+        For recordings: whether to ignore the other sensors, whose units are then not needed, as :func:`integrate` does.
 
     Returns
     -------
@@ -75,19 +77,24 @@ def read(
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
-    declared = {"units": units, "columns": columns, "topic": topic, "axes": axes, "invert": invert}
+    declared = {
+        "units": units,
+        "columns": columns,
+        "topic": topic,
+        "axes": axes,
+        "invert": invert,
+        "gyro_alone": gyro_alone,
+    }
     options: dict[str, Any] = {name: value for name, value in declared.items() if value}
     if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
         if topic:
             raise InputError(f"{Hint('topic')} is for a bag or a flight log; leave it out")
-        table = recordings.from_table(path, units=units, columns=columns)
+        table = recordings.from_table(path, units=units, columns=columns, gyro_alone=gyro_alone)
         return recordings.with_axes(table, axes, invert) if axes or invert else table
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
-    kinds = {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
-    kind = ""
-    if file.is_file():
-        kind = "record" if recordfiles.is_record(file) else kinds.get(reading.kind(file), "")
+    kinds = {recordfiles.KIND: "record", "strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
+    kind = kinds.get(reading.kind(file), "")
     if not kind:
         return recordings.read(file, **options)
     if options:
@@ -116,7 +123,8 @@ def write(
         The suffix selects the format: ``.h5`` holds a record or an estimate completely, with its filter, origin and truth, ``.toml`` a
         scenario or a filter setup; :data:`strapdown.recordings.FORMATS` lists the others for recordings and estimates.
     **options
-        Options of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` for an estimate as a table.
+        Options of the format: for an estimate as a table ``sequence`` and ``frame`` (:meth:`strapdown.records.Estimate.table`), and
+        ``recording``, from which it was made, whose samples a ROS bag needs.
 
     Returns
     -------

@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import (
-    ahrs,
-    allan,
-    gyro,
-    units,
-)
+from strapdown import ahrs, allan, gyro, units
 from strapdown.checks import Hint, InputError, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup, for_record

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import (
-    coning,
-    quaternion,
-    recordings,
-)
+from strapdown import coning, quaternion, recordings
 from strapdown.checks import Array, InputError, instance
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
-
-if TYPE_CHECKING:
-    pass
 from strapdown.workflows.estimating import SOURCE
 
 

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strapdown import (
-    consistency,
-)
+from strapdown import consistency
 from strapdown.checks import Hint, InputError, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
@@ -19,6 +17,7 @@ from strapdown.estimation.states import State
 from strapdown.recordings import Recording
 from strapdown.recordings.attitudes import Attitudes
 from strapdown.records import Estimate, ImuRecord, Truth
+from strapdown.records.recording import matched
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Statistics
@@ -182,7 +181,7 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
         whole = Truth.of_reference(truth.true_attitude, truth.movement)
     if whole is None:
         raise InputError("truth is a record without a truth; leave it out to test the innovations only")
-    rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
-    if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
+    rows, same = matched(truth.time, result.time, SAME_STAMP)
+    if not same.all():
         raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
     return whole.taken(rows)

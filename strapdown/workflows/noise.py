@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from strapdown import (
-    allan,
-    recordings,
-)
+from strapdown import allan, recordings
 from strapdown.checks import InputError
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord

@@ -13,12 +13,12 @@ from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
+from strapdown.workflows.estimating import SOURCE, warn_about_conventions
+from strapdown.workflows.filters import need_angles
 
 if TYPE_CHECKING:
     from strapdown.tuning import Prior, Tuning
     from strapdown.tuning.procedure import Tuned
-from strapdown.workflows.estimating import SOURCE, warn_about_conventions
-from strapdown.workflows.filters import need_angles
 
 
 def tune(
