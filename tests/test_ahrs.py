@@ -735,7 +735,11 @@ def test_no_sensor_is_early():
 
 def test_delays_that_change_are_told_by_their_last_values():
     found = sensor_delays.Delays(
-        gyro=np.array([1e-3, 2e-3, 4e-3]), sigma=1e-3, field=np.array([0.0, -8e-3, -5e-3]), field_sigma=2e-3, given=True
+        gyro=np.array([1e-3, 2e-3, 4e-3]),
+        sigma=1e-3,
+        field=np.array([0.0, -8e-3, -5e-3]),
+        field_sigma=2e-3,
+        is_specified=True,
     )
     assert (found.last_gyro, found.last_field) == (4e-3, -5e-3)
     assert found.words == (

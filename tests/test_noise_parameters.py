@@ -181,7 +181,7 @@ def test_the_interval_that_differs_most_is_named(change):
     time = whole.time + np.where(np.arange(100) > 40, change * DT, 0.0)
     words = f"the interval after {time[40]:.6g} s is {(1.0 + change) * DT:.6g} s"
     with pytest.raises(InputError, match=re.escape(words)):
-        broad.sample_interval(replace(whole, time=time))
+        broad.sample_interval(whole.source, time)
 
 
 def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):

@@ -68,13 +68,13 @@ def register(command: str | None = None) -> None:
     places = {name: (title, *place) for title, group in COMMANDS.items() for name, place in group.items()}
     for module in dict.fromkeys(place[1] for name, place in places.items() if name == command or command not in places):
         importlib.import_module(f"strapdown.cli.{module}")
-    name_of = lambda one: one.callback.__name__.replace("_", "-")  # noqa: E731
-    app.registered_commands.sort(key=lambda one: list(places).index(name_of(one)))
-    for one in app.registered_commands:
-        name = name_of(one)
-        one.rich_help_panel, _, *examples = places[name]
+    name_of = lambda registered: registered.callback.__name__.replace("_", "-")  # noqa: E731
+    app.registered_commands.sort(key=lambda registered: list(places).index(name_of(registered)))
+    for registered in app.registered_commands:
+        name = name_of(registered)
+        registered.rich_help_panel, _, *examples = places[name]
         lines = (f"  strapdown {name} {arguments}".rstrip() for arguments in examples)
-        one.epilog = "\n\n".join(("Examples:", *lines)) if examples else None
+        registered.epilog = "\n\n".join(("Examples:", *lines)) if examples else None
 
 
 @app.callback(invoke_without_command=True)
@@ -113,7 +113,7 @@ def main() -> None:
     if "--quiet" in sys.argv[1:]:
         sys.argv = [sys.argv[0], "--quiet", *(argument for argument in sys.argv[1:] if argument != "--quiet")]
     try:
-        register(next((one for one in sys.argv[1:] if not one.startswith("-")), None))
+        register(next((argument for argument in sys.argv[1:] if not argument.startswith("-")), None))
         app(standalone_mode=True)
     except InputError as error:
         errors.print(f"error: {error}", soft_wrap=True)

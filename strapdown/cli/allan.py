@@ -64,7 +64,7 @@ def allan(
     """Identify the noise of a sensor from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown.allan.noise_fit import SENSORS
 
-    sensors = [one_of("--sensor", one, SENSORS) for one in dict.fromkeys(options.sensor or ["gyro"])]
+    sensors = [one_of("--sensor", sensor, SENSORS) for sensor in dict.fromkeys(options.sensor or ["gyro"])]
     if (output.kalibr or output.px4) and not {"gyro", "accelerometer"} <= set(sensors):
         raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
     positive("--factor", output.factor)
@@ -79,12 +79,12 @@ def allan(
     ):
         if wanted:
             exports[output.out / name] = partial(getattr(sd.allan.parameters, to), source=recording.name, **more)
-    own = [file for one in sensors for file in output.files(one)]
+    own = [file for sensor in sensors for file in output.files(sensor)]
     ui.check_files(*own, *exports, tables=output.tables, sources=(recording,))
     # For simulated records and arrays the reader raises errors for options that do not apply.
     plain_units = recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None)
     layout = {"units": samples.units} if plain_units else samples.options(recording)
-    fits = {one: _identify(recording, one, layout, options, output) for one in sensors}
+    fits = {sensor: _identify(recording, sensor, layout, options, output) for sensor in sensors}
     for file, text in exports.items():
         write_text(file, text(fits))
     ui.written(*exports)

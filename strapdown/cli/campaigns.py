@@ -115,11 +115,11 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
         for name in ui.options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
-    given = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
+    from_file = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
     plan = workflows.plan(
         sd.scenarios.load_scenario(scenario),
         gyro=None if model.gyro is None else sd.gyro.read_spec(model.gyro),
-        setup=given if own is None else own,
+        setup=from_file if own is None else own,
         seed=model.seed,
         states=model.states,
         dispersions=None if model.dispersions is None else sd.montecarlo.read_dispersions(model.dispersions),
@@ -192,13 +192,13 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
         if asked:
             raise KeyboardInterrupt
 
-    heeded = [one for one in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(one) is not signal.SIG_IGN]
-    before = {one: signal.signal(one, ask) for one in heeded}
+    heeded = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, ask) for number in heeded}
     try:
         yield again
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for heeded_signal, handler in before.items():
+            signal.signal(heeded_signal, handler)
 
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Any]]:

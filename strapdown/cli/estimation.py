@@ -179,12 +179,12 @@ def estimate(
     if field is not None:
         run = run._replace(estimate=field.to_true_north(run.estimate))
     if simulated:
-        vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
+        vectors = ", ".join(f"{len(series.time)} of {series.sensor}" for series in source.vectors) or "no measurements"
         length = source.time[-1] - source.time[0]
         ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
     ui.say(*run.estimate.remarks)
     ui.show(run.estimate.listing())
-    figures = (f"{name}.{one}" for name in FIGURES for one in ("png", "pdf", "svg"))
+    figures = (f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf", "svg"))
     for name in (*FILES[1:], *figures, *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
     contents = _shown(run, observability=shared.observability)
@@ -217,9 +217,9 @@ def _shown(run: Run, *, observability: bool) -> dict[str, Any]:
         contents["states.json"] = {name: states.summary() for name, states in run.estimate.error_states.items()}
     if observability:
         with ui.progress_bar("observability"):
-            found = setup.observability(run.record, run.setup, run.initial)
-        ui.say(str(found))
-        contents["observability.json"] = found.summary()
+            analysis = setup.observability(run.record, run.setup, run.initial)
+        ui.say(str(analysis))
+        contents["observability.json"] = analysis.summary()
     if run.estimate.truth is not None:
         accuracy = sd.accuracy(run.estimate)
         ui.show(accuracy.listing())
@@ -240,10 +240,14 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, d
     exports = {}
     for target in output.to or ():
         writable("to", target, sources=(recording,))
-        chosen = sd.recordings.estimate_format(target, wanted, recording=not sd.recordings.is_record(recording))
+        file_format = sd.recordings.estimate_format(target, wanted, recording=not sd.recordings.is_record(recording))
         exports[target] = dict[str, Any](wanted)
         # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
-        if "source" in chosen.estimate_options and sd.recordings.format_of(recording) is chosen and not changed:
+        if (
+            "source" in file_format.estimate_options
+            and sd.recordings.format_of(recording) is file_format
+            and not changed
+        ):
             exports[target]["source"] = recording
     return exports
 

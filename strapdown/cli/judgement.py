@@ -100,7 +100,7 @@ def _judged_own(result: Path, how: dict[str, Any]) -> tuple[Any, Judgement, dict
         truth = "no truth"
         if held.truth is not None:
             truth = "with its truth" if held.truth.has_bias else "with a reference attitude"
-        number = sum(len(one.time) for one in held.innovations.values())
+        number = sum(len(innovations.time) for innovations in held.innovations.values())
         length = held.time[-1] - held.time[0]
         ui.say(f"{result.name}: {len(held.time)} epochs over {length:.6g} s, {number} measurements, {truth}.")
     else:
@@ -154,11 +154,11 @@ def _diagnosed(
     if not isinstance(held, sd.records.Estimate):
         raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
     source = read_record(record)
-    chosen = held.setup if filter_file is None else read_setup(filter_file)
-    missing = () if chosen is None else unmodelled_errors(source.origin, chosen)
-    ui.say(*no_state_words(missing, chosen))
+    filter_setup = held.setup if filter_file is None else read_setup(filter_file)
+    missing = () if filter_setup is None else unmodelled_errors(source.origin, filter_setup)
+    ui.say(*no_state_words(missing, filter_setup))
     with ui.progress_bar("searching for causes"), reading.from_file(record):
-        diagnosis, reason = sd.diagnose(held, source, setup=chosen, judgement=judgement)
+        diagnosis, reason = sd.diagnose(held, source, setup=filter_setup, judgement=judgement)
     if diagnosis is None:
         ui.say(f"Causes were not searched for: {reason}.")
         return {"not_looked_for": reason, "without_a_state": missing}, judgement, judgement.words

@@ -43,12 +43,12 @@ class Samples:
         """Return the options of :func:`strapdown.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
-        given = options_given(self)
+        names = options_given(self)
         if recordings.is_record(path):
-            if given:
+            if names:
                 what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
-                own = "contains its units" if given[0].endswith("-unit") else "needs none"
-                raise InputError(f"{given[0]} applies to {what.get(given[0], 'a table')}; the record {path} {own}")
+                own = "contains its units" if names[0].endswith("-unit") else "needs none"
+                raise InputError(f"{names[0]} applies to {what.get(names[0], 'a table')}; the record {path} {own}")
             return {}
         columns = recordings.parse_mapping(self.columns) if self.columns else None
         values = {"units": self.units, "columns": columns, "topic": self.topic}

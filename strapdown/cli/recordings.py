@@ -28,7 +28,7 @@ def doctor(
     with ui.progress_bar("testing conventions"):
         checked = sd.ahrs.check_conventions.examine(source)
     ui.say(f"{checked.source}: {checked.words}", *(f"warning: {words}." for words in checked.doubts))
-    ui.say(*(f"Note: {one}" for one in source.remarks))
+    ui.say(*(f"Note: {remark}" for remark in source.remarks))
     if checked.candidates:
         ui.show(checked.listing())
     ui.say(*(f"Note: {note}." for note in checked.notes))

@@ -31,13 +31,13 @@ def keys(
     """Print the keys of a scenario file with units, defaults and an example. Without a section: all sections."""
     from strapdown.scenarios import keys as reference
 
-    for one in reference.sections() if section is None else reference.named(section):
-        table = reference.listing(one)
-        if section is None or not one.keys:
+    for part in reference.sections() if section is None else reference.named(section):
+        table = reference.listing(part)
+        if section is None or not part.keys:
             ui.say(table.title)
         else:
             ui.show(table)
-            ui.say(f"Example:\n{reference.example(one)}")
+            ui.say(f"Example:\n{reference.example(part)}")
     if section is None:
         ui.say("The keys of one section: strapdown keys SECTION, such as gyro or coning.")
 
@@ -51,18 +51,18 @@ def simulate(
     """Simulate a scenario: a record with its truth."""
     from strapdown.recordings import recordfiles
 
-    chosen = sd.scenarios.load_scenario(scenario)
-    used = chosen.seed if seed is None else seed
+    loaded = sd.scenarios.load_scenario(scenario)
+    used = loaded.seed if seed is None else seed
     target = out or Path(f"{Path(scenario).stem}.h5")
     own = recordfiles.is_record
     ui.check_files(target, suffixes=(".h5", ".hdf5"), sources=(scenario,), own=own, command="simulate")
     with ui.progress_bar("simulating, writing", 2) as advance:
-        record = sd.scenarios.simulate(chosen, used)
+        record = sd.scenarios.simulate(loaded, used)
         advance(1)
         recordfiles.write_record(target, record)
         advance(1)
     length = record.time[-1] - record.time[0]
-    ui.say(f"{chosen.name or target.stem}: {len(record.increments)} gyro samples over {length:g} s, seed {used}.")
+    ui.say(f"{loaded.name or target.stem}: {len(record.increments)} gyro samples over {length:g} s, seed {used}.")
     for series in record.vectors:
         ui.say(f"  {series.sensor}: {len(series.time)} measurements ({series.kind})")
         sigma = series.sigma if series.sigma_axes is None else series.sigma_axes

@@ -33,7 +33,7 @@ def coning(
     """Study coning: the drift of each integration algorithm, and its effect on a filter."""
     from strapdown.montecarlo import coning_study
 
-    own = tuple(one for path in algorithm or () for one in sd.coning.read_algorithms(path))
+    own = tuple(custom for path in algorithm or () for custom in sd.coning.read_algorithms(path))
     motion = {"angle": angle * DEGREE, "frequency": frequency, "rate": rate, "duration": duration}
     parameters = coning_study.ConingParameters(**motion, runs=runs, seed=seed, own=own)  # type: ignore[arg-type]
     names = ("drift", "errors", "consistency")
@@ -108,19 +108,19 @@ def covariance(
     files = (out / "covariance.json", out / f"budget.{form}")
     ui.check_files(*files, tables=tables, sources=(scenario, filter_file))
     errors = _considered(consider or (), body.sensors)
-    given = None if filter_file is None else setup.read_setup(filter_file)
-    chosen = filter_for_scenario(body, setup=given, states=states)
+    from_file = None if filter_file is None else setup.read_setup(filter_file)
+    filter_setup = filter_for_scenario(body, setup=from_file, states=states)
     with ui.progress_bar("covariance analysis"):
-        result = sd.covariance_analysis(body, chosen, epochs=epochs, **errors)
+        result = sd.covariance_analysis(body, filter_setup, epochs=epochs, **errors)
     name = body.name or Path(scenario).stem
-    what = "the filter given" if given else "the filter that matches it"
-    ui.say(f"{name}, {what}, integration {chosen.integration.name}.\n")
+    what = "the filter given" if from_file else "the filter that matches it"
+    ui.say(f"{name}, {what}, integration {filter_setup.integration.name}.\n")
     budget = result.listing()
     ui.show(budget)
-    if not given:
-        if states is None and chosen.states is not None:
-            ui.say(state_words(chosen.states.names))
-        missing = setup.unmodelled_errors(body.gyro, body.sensors, chosen.states, gravity_f=body.gravity_f)
+    if not from_file:
+        if states is None and filter_setup.states is not None:
+            ui.say(state_words(filter_setup.states.names))
+        missing = setup.unmodelled_errors(body.gyro, body.sensors, filter_setup.states, gravity_f=body.gravity_f)
         if missing:
             ui.say(f"The filter has no state for {', '.join(missing)}.")
     write_json(files[0], {"scenario": name, **result.summary()})
@@ -156,7 +156,7 @@ def integrate(
     """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
     own = lambda path: sd.records.read_attributes(path)["kind"] == "strapdown attitude"  # noqa: E731
     ui.check_files(out, suffixes=(".h5", ".hdf5"), sources=(recording,), own=own, command="integrate")
-    chosen, options, simulated = (
+    rule, options, simulated = (
         sd.coning.named(algorithm),
         layout.options(recording),
         sd.recordings.is_record(recording),
@@ -167,15 +167,15 @@ def integrate(
         truth = source.truth and source.truth.attitude if simulated else source.true_attitude
         advance(1)
         with reading.from_file(recording):
-            time, attitude = sd.integrate(source, chosen)
+            time, attitude = sd.integrate(source, rule)
         advance(1)
-        sd.records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": chosen.name})
+        sd.records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": rule.name})
         advance(1)
-    ui.say(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
-    if left := samples % chosen.samples:
-        ui.say(f"Samples not used at the end, an incomplete step of {chosen.samples}: {left}.")
+    ui.say(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {rule.name}.")
+    if left := samples % rule.samples:
+        ui.say(f"Samples not used at the end, an incomplete step of {rule.samples}: {left}.")
     if truth is not None:
-        reference = truth[:: chosen.samples][: len(attitude)]
+        reference = truth[:: rule.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
         if known.any():
             error = np.degrees(sd.quaternion.angle_between(sd.quaternion.normalize(reference[known]), attitude[known]))

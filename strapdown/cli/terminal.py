@@ -70,7 +70,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         function(**values, **grouped)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return app.command()(run)
 
 

@@ -110,9 +110,9 @@ def tune(
     inputs, own = (*records, start.filter_file), lambda _: bool(tunings.read(beside))
     ui.check_files(out, suffixes=(".toml",), sources=inputs, own=own, command="tune")
     ui.check_files(beside, *places.values(), tables=tables, sources=inputs, own=own, command="tune")
-    chosen = None if start.filter_file is None else read_setup(start.filter_file)
-    sources = _sources(records, chosen, start, layout)
-    if chosen is not None and (chosen.gate or chosen.robust) and not (goal.truth or goal.gate):
+    filter_setup = None if start.filter_file is None else read_setup(start.filter_file)
+    sources = _sources(records, filter_setup, start, layout)
+    if filter_setup is not None and (filter_setup.gate or filter_setup.robust) and not (goal.truth or goal.gate):
         ui.say(
             "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
             "and --truth tunes the filter with its gate and weights."
@@ -121,7 +121,7 @@ def tune(
         result, objective, _ = tuned(
             sources,
             names=[path.name for path in records],
-            setup=chosen,
+            setup=filter_setup,
             free=free,
             states=start.states,
             priors=start.spec,
@@ -142,7 +142,7 @@ def tune(
     content = {"records": [path.name for path in records], **result.summary(), "slices": slices.summary()}
     write_json(beside, content)
     answer, reason, details = sd.tuning.fitting.verdict(result)
-    ui.say(f"{answer}: {reason}.", *(f"  - {one}" for one in details if result.comparison is not None))
+    ui.say(f"{answer}: {reason}.", *(f"  - {detail}" for detail in details if result.comparison is not None))
     figures = {places["likelihood"]: drawing.likelihood_slices(slices, result)}
     if result.comparison is not None:
         title = "Held-out part of the first record"
@@ -150,7 +150,7 @@ def tune(
     ui.written(out, beside, *sd.plots.save_as(figures, form), tables=(tables, listed))
 
 
-def _sources(paths: list[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout) -> list[Any]:
+def _sources(paths: list[Path], filter_setup: FilterSetup | None, start: _Filter, layout: Layout) -> list[Any]:
     """Return the records; say what the filter of the first does not model."""
     from strapdown.recordings import recordfiles
     from strapdown.workflows.filters import matched_filter
@@ -159,7 +159,7 @@ def _sources(paths: list[Path], chosen: FilterSetup | None, start: _Filter, layo
     for path in paths:
         if recordfiles.is_record(path):
             source: Any = recordfiles.read_record(path)
-            if chosen is None and not any(isinstance(one, type(source)) for one in sources):
+            if filter_setup is None and not any(isinstance(other, type(source)) for other in sources):
                 ui.say(*matched_filter(source, states=start.states)[1])
         else:
             if start.states:

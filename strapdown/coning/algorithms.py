@@ -162,15 +162,15 @@ class Algorithm:
         >>> own.samples, own.order, own.drift_order, str(own.drift_constant)
         (3, 3, 6, '1/280')
         """
-        given = _rationals(f"{name}: coefficients", coefficients)
+        rationals = _rationals(f"{name}: coefficients", coefficients)
         checks.count(f"{name}: previous", previous, minimum=0)
-        samples = len(given) + 1 - previous
+        samples = len(rationals) + 1 - previous
         if samples < 1:
             raise InputError(
-                f"{name}: {len(given)} coefficients with previous {previous} leave no increment in the step; give at least {previous}"
+                f"{name}: {len(rationals)} coefficients with previous {previous} leave no increment in the step; give at least {previous}"
             )
-        own = tuple(reversed(given))
-        table = exact.outer_pairs((*given, Fraction(0)), (*[Fraction(0)] * len(given), Fraction(1)))
+        own = tuple(reversed(rationals))
+        table = exact.outer_pairs((*rationals, Fraction(0)), (*[Fraction(0)] * len(rationals), Fraction(1)))
         return cls(
             name=name,
             solver="compressed",
@@ -278,16 +278,16 @@ class Algorithm:
                 raise InputError(f"{place}: samples is missing; give the number of increments in a step")
             return cls.from_products(products=entries, **rest)
         wanted, late = rest.pop("samples", None), rest.pop("following", 0)
-        made = cls.from_coefficients(coefficients=entries, **rest)
-        if wanted is not None and wanted != made.samples:
+        algorithm = cls.from_coefficients(coefficients=entries, **rest)
+        if wanted is not None and wanted != algorithm.samples:
             raise InputError(
-                f"{place}: samples is {wanted}, but {len(entries)} coefficients and previous {made.previous} need {made.samples}"
+                f"{place}: samples is {wanted}, but {len(entries)} coefficients and previous {algorithm.previous} need {algorithm.samples}"
             )
         if late:
             raise InputError(
                 f"{place}: following is {late}, but coefficients use no increments after the step; give products"
             )
-        return made
+        return algorithm
 
     def to_table(self) -> dict[str, Any]:
         """Return the algorithm as a table for :meth:`from_table`.
@@ -389,15 +389,15 @@ class Algorithm:
 
 
 def _rationals(place: str, values: Iterable[Coefficient]) -> Rationals:
-    found = []
+    rationals = []
     for k, value in enumerate(values):
         try:
-            found.append(exact.rational(value))
+            rationals.append(exact.rational(value))
         except (ValueError, TypeError, ZeroDivisionError, OverflowError):
             raise InputError(
                 f'{place}[{k}] is {value!r}; give a number, a fraction in quotes such as "27/20", or fractions.Fraction'
             ) from None
-    return tuple(found)
+    return tuple(rationals)
 
 
 def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
@@ -418,20 +418,20 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
         checks.known_keys(f"{path}", content, ("algorithm",))
         tables = content.get("algorithm")
         several = isinstance(tables, list)
-        found = [
+        entries = [
             (f"{path}: algorithm" + (f"[{k}]" if several else ""), table)
             for k, table in enumerate(tables if isinstance(tables, list) else [tables])
         ]
-        if not found or not all(isinstance(table, Mapping) for _, table in found):
+        if not entries or not all(isinstance(table, Mapping) for _, table in entries):
             raise InputError(f"{path} has no table [algorithm]; add one with name, and coefficients or products")
-        made = tuple(Algorithm.from_table(table, place) for place, table in found)
-    names = [one.name for one in made]
-    for one in made:
-        if names.count(one.name) > 1:
-            raise InputError(f"{path} has two algorithms of the name {one.name}; give each a different name")
-        if one.name in ALGORITHMS:
-            raise InputError(f"{path}: {one.name} is the name of a built-in algorithm; choose another")
-    return made
+        algorithms = tuple(Algorithm.from_table(table, place) for place, table in entries)
+    names = [algorithm.name for algorithm in algorithms]
+    for algorithm in algorithms:
+        if names.count(algorithm.name) > 1:
+            raise InputError(f"{path} has two algorithms of the name {algorithm.name}; give each a different name")
+        if algorithm.name in ALGORITHMS:
+            raise InputError(f"{path}: {algorithm.name} is the name of a built-in algorithm; choose another")
+    return algorithms
 
 
 def _scheme_products(solver: str, samples: int) -> Table:
@@ -605,10 +605,10 @@ def named(algorithm: str | Algorithm) -> Algorithm:
     if isinstance(algorithm, Algorithm):
         return algorithm
     if isinstance(algorithm, str) and algorithm.lower().endswith(".toml"):
-        found = read_algorithms(algorithm)
-        if len(found) > 1:
-            raise InputError(f"{algorithm} holds {len(found)} algorithms; choose one of coning.read_algorithms")
-        return found[0]
+        algorithms = read_algorithms(algorithm)
+        if len(algorithms) > 1:
+            raise InputError(f"{algorithm} holds {len(algorithms)} algorithms; choose one of coning.read_algorithms")
+        return algorithms[0]
     return ALGORITHMS[checks.one_of("algorithm", algorithm, ALGORITHMS)]
 
 

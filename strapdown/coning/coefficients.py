@@ -211,10 +211,10 @@ def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
                 for p in (a, b)
             )
             # Since K is antisymmetric, Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j.
-            made = sum(
+            total = sum(
                 (k * x * y for row, x in zip(pairs, u, strict=True) for k, y in zip(row, v, strict=True)), Fraction(0)
             )
-            if made != n ** (degree + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / (2 * (degree + 2)):
+            if total != n ** (degree + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / (2 * (degree + 2)):
                 return degree + 1
     return 4
 

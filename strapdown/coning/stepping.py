@@ -281,14 +281,14 @@ def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tup
     apart = np.zeros(len(start))
     for j in range(window):
         apart = np.maximum(apart, np.abs(lengths[start + j] - mean))
-    chosen = np.flatnonzero(apart > EVEN * mean)
-    if len(chosen) == 0:
+    uneven = np.flatnonzero(apart > EVEN * mean)
+    if len(uneven) == 0:
         return none
-    steps = np.empty((len(chosen), 4))
+    steps = np.empty((len(uneven), 4))
     compiled(integration_uneven.uneven_steps)(
         increments,
         stamps,
-        chosen,
+        uneven,
         table.samples,
         previous,
         window,
@@ -299,7 +299,7 @@ def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tup
         np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4)),
         steps,
     )
-    return chosen, steps
+    return uneven, steps
 
 
 def _compressed_array(table: Algorithm, previous: int) -> Array:

@@ -140,19 +140,21 @@ def mean_innovation_p_value(whitened: ArrayLike) -> tuple[Array, float]:
 
 
 def cross_correlation_p_value(
-    one_time: ArrayLike, one: ArrayLike, other_time: ArrayLike, other: ArrayLike
+    time: ArrayLike, whitened: ArrayLike, other_time: ArrayLike, other: ArrayLike
 ) -> tuple[Array, int, float]:
     """Return the correlation of two sensors' whitened innovations (dof, dof), the number of pairs, and the p-value that it is zero.
 
-    Each innovation of the other is paired with the last of the one at or before it, and each is used once at most. For a consistent filter
-    they are independent whatever their times. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²), is χ² with p q
-    degrees of freedom; if there are too few pairs, it is NaN.
+    Each innovation of the other is paired with the last of the first sensor at or before it, and each is used once at most. For a
+    consistent filter they are independent whatever their times. Bartlett's test of canonical correlations,
+    −(N − (p + q + 1)/2) Σ ln(1 − ρ²), is χ² with p q degrees of freedom; if there are too few pairs, it is NaN.
     """
     from scipy.special import chdtrc
 
-    a, b = _series(one), _series(other)
-    ta, tb = array("one_time", one_time, (len(a),)), array("other_time", other_time, (len(b),))
-    before = np.searchsorted(ta, tb, side="right") - 1  # index of the last of the one at or before each of the other
+    a, b = _series(whitened), _series(other)
+    ta, tb = array("time", time, (len(a),)), array("other_time", other_time, (len(b),))
+    before = (
+        np.searchsorted(ta, tb, side="right") - 1
+    )  # index of the last of the first sensor at or before each of the other
     first = np.ones(len(tb), bool)
     first[1:] = before[1:] != before[:-1]
     used = first & (before >= 0)

@@ -233,11 +233,11 @@ def content(path: Name, *, link: bool = True, maximum: int | None = None) -> byt
 
 def text(path: Name, *, link: bool = True, maximum: int | None = None) -> str:
     """Return the text of a file in UTF-8."""
-    found = content(path, link=link, maximum=maximum)
-    if b"\0" in found:
+    raw = content(path, link=link, maximum=maximum)
+    if b"\0" in raw:
         raise InputError(f"{path} cannot be read as text (it has zero bytes); the file is damaged or of another kind")
     try:
-        return found.decode("utf-8-sig")
+        return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path} cannot be read as text ({error}); write it in UTF-8") from None
 
@@ -340,8 +340,8 @@ def kind(path: Name) -> str:
     if Path(path).is_dir() or not is_hdf5(path):
         return ""
     with hdf5(path) as file:
-        found = str(attributes(file).get("kind", ""))
-    return found if found.startswith("strapdown ") else ""
+        name = str(attributes(file).get("kind", ""))
+    return name if name.startswith("strapdown ") else ""
 
 
 def has_digest(path: Name) -> bool:
@@ -350,8 +350,8 @@ def has_digest(path: Name) -> bool:
         block = handle.read(BLOCK)
         if not block.startswith(SEAL):
             return False
-        found = hashlib.file_digest(handle, "sha256").hexdigest()
-    if block.removeprefix(SEAL)[:64] != found.encode():
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    if block.removeprefix(SEAL)[:64] != digest.encode():
         raise InputError(
             f"{path} cannot be read: its content does not match its digest, so it is damaged or truncated; restore a copy, or make it "
             "again (if you changed it on purpose, strapdown.files.seal writes a new digest)"
@@ -471,7 +471,7 @@ def _plain(value: Any) -> Any:
         return value.decode("utf-8", "replace")  # another program may use another encoding
     if isinstance(value, (np.ndarray, np.generic)):
         return _plain(value.tolist()) if value.dtype.kind in "SO" else value.tolist()
-    return [_plain(one) for one in value] if isinstance(value, list) else value
+    return [_plain(item) for item in value] if isinstance(value, list) else value
 
 
 def numbers(group: Any, name: str) -> np.ndarray[Any, Any]:

@@ -113,8 +113,8 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
 
     for name, value in values.items():
         texts = [value] if isinstance(value, str) else value
-        if isinstance(texts, (list, tuple)) and all(isinstance(one, str) for one in texts):
-            held = [one.encode("utf-8", "backslashreplace") for one in texts]
+        if isinstance(texts, (list, tuple)) and all(isinstance(item, str) for item in texts):
+            held = [item.encode("utf-8", "backslashreplace") for item in texts]
             dtype = h5py.string_dtype("utf-8", max((1, *map(len, held))))
             node.attrs.create(name, held[0] if isinstance(value, str) else np.array(held, dtype), dtype=dtype)
         else:
@@ -158,9 +158,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {key: plain(one) for key, one in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -110,9 +110,9 @@ WRITER = "`strapdown allan` writes one, with the order of the polynomial as its 
 def read(path: str | os.PathLike[str]) -> BiasOverTemperature:
     """Read the table ``[gyro.temperature]`` of a TOML file such as ``gyro-temperature.toml``."""
 
-    def found(table: Mapping[str, Any], place: str) -> BiasOverTemperature:
+    def from_fit(table: Mapping[str, Any], place: str) -> BiasOverTemperature:
         if "temperature" not in table:
             raise InputError(f"{place} has no table [gyro.temperature]; {WRITER}")
         return from_table(table["temperature"], f"{place}: temperature")
 
-    return tables.read(path, "gyro", WRITER, found)  # type: ignore[no-any-return]
+    return tables.read(path, "gyro", WRITER, from_fit)  # type: ignore[no-any-return]

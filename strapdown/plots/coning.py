@@ -93,7 +93,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     first = outcomes[0]
     percent = f"{100 * PROBABILITY:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        verdicts = [one.verdicts[subset] for one in outcomes]
+        verdicts = [outcome.verdicts[subset] for outcome in outcomes]
         bounds = verdicts[0].simultaneous_bounds
         nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
         ax.plot(
@@ -105,16 +105,18 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
             transform=ax.get_xaxis_transform(),
             label="judged epoch",
         )
-        passed = [one for one, verdict in zip(outcomes, verdicts, strict=True) if verdict.consistent]
+        passed = [outcome for outcome, verdict in zip(outcomes, verdicts, strict=True) if verdict.consistent]
         title = f"{subset.capitalize()}: {len(passed)} of {len(outcomes)} pass"
-        if any(_leaves(one, subset, bounds) for one in passed):
+        if any(_leaves(outcome, subset, bounds) for outcome in passed):
             title += "\nOutside the bounds only\nat epochs not judged"
         ax.set_title(title, loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
     nis_over_time(named, axes[2], label=f"NIS: {percent} bounds, each interval")
     passing = [
-        low <= one.statistics.mean_nis <= high for one in outcomes for low, high in [one.statistics.nis_bounds()]
+        low <= outcome.statistics.mean_nis <= high
+        for outcome in outcomes
+        for low, high in [outcome.statistics.nis_bounds()]
     ]
     axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nTest of the mean over all time", loc="left")
     style.legend_below(figure, list(axes))

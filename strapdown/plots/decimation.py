@@ -42,13 +42,13 @@ def extreme_rows(time: Array, value: Array, columns: int = LINE_COLUMNS) -> NDAr
         return np.arange(n)
     starts = column_starts(time, columns)
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=n))
-    found = [np.array([0, n - 1])]
+    parts = [np.array([0, n - 1])]
     for reduce, missing in ((np.fmin, starts), (np.fmax, np.append(starts[1:], n) - 1)):
         hits = np.flatnonzero(value == reduce.reduceat(value, starts)[group])
         rows = missing.copy()
         rows[group[hits][::-1]] = hits[::-1]  # reversed, so that the first of equal values is kept
-        found.append(rows)
-    return np.unique(np.concatenate(found))
+        parts.append(rows)
+    return np.unique(np.concatenate(parts))
 
 
 def decimated(time: Array, value: Array, columns: int = LINE_COLUMNS) -> tuple[Array, Array]:

@@ -24,11 +24,15 @@ THREE_SIGMA = "±3σ (99.7 %)"
 
 def band(ax: Axes, time: Array, low: Array, high: Array, **look: Any) -> None:
     """Fill between two series (n,); for long series between the extremes of each column."""
-    found = envelope(time, low, high)
+    outline = envelope(time, low, high)
     if len(time) <= BAND_COLUMNS:
-        ax.fill_between(*found, linewidth=0, **look)
+        ax.fill_between(*outline, linewidth=0, **look)
         return
-    ends = (np.append(found.time, time[-1]), np.append(found.low, found.low[-1]), np.append(found.high, found.high[-1]))
+    ends = (
+        np.append(outline.time, time[-1]),
+        np.append(outline.low, outline.low[-1]),
+        np.append(outline.high, outline.high[-1]),
+    )
     ax.fill_between(*ends, step="post", linewidth=0, **look)
 
 
@@ -43,9 +47,9 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
     if len(time) <= BAND_COLUMNS:
         band(ax, time, -bound, bound, color=style.SKY, alpha=0.35, label=f"{THREE_SIGMA} of the filter")
     else:
-        found = envelope(time, bound)
-        edges = np.append(found.time, time[-1])
-        least, most = (np.append(values, values[-1]) for values in (found.low, found.high))
+        outline = envelope(time, bound)
+        edges = np.append(outline.time, time[-1])
+        least, most = (np.append(values, values[-1]) for values in (outline.low, outline.high))
         inner: dict[str, Any] = {"color": style.SKY, "alpha": 0.35, "linewidth": 0, "step": "post"}
         outer = {**inner, "alpha": 0.18}
         ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **inner)
@@ -53,9 +57,9 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
             ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **outer)
             ax.fill_between(edges, -most, -least, **outer)
     ax.axhline(0.0, color=style.ink(), linewidth=0.6)
-    for k, one in enumerate(error):
+    for k, component in enumerate(error):
         ax.plot(
-            *decimated(time, one),
+            *decimated(time, component),
             color=style.VERMILION,
             linewidth=0.8,
             alpha=0.8,
@@ -136,7 +140,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     """Draw the error states of an estimate over time with their ±3σ, one axes for each declaration and unit, in their order."""
     panels = [
-        (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
+        (name, block, unit, [k for k, state_unit in enumerate(block.units) if state_unit == unit])
         for name, block in estimate.error_states.items()
         for unit in dict.fromkeys(block.units)
     ]

@@ -91,8 +91,8 @@ def nis_over_time(
     """
     ax = style.axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):
-        seen = statistics.nis_degrees > 0
-        ax.plot(statistics.nis_time[seen], statistics.nis[seen], label=name, **style.layered(k, len(named)))
+        measured = statistics.nis_degrees > 0
+        ax.plot(statistics.nis_time[measured], statistics.nis[measured], label=name, **style.layered(k, len(named)))
     first = named[0][1]
     typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
     words = label or f"{100 * probability:g} % bounds, each interval"
@@ -115,7 +115,9 @@ def runs_overview(statistics: Statistics) -> Figure:
     label = "99 % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
-        bounds = next((one.low, one.high) for one in findings if (one.name, one.of) == ("ANEES", subset))
+        bounds = next(
+            (finding.low, finding.high) for finding in findings if (finding.name, finding.of) == ("ANEES", subset)
+        )
         nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
         anees = statistics.anees[judged, ("state", "attitude", "bias").index(subset)]
         ax.plot(statistics.time[judged], anees, ".", color=style.CYCLE[0], label="epochs judged")
@@ -124,7 +126,7 @@ def runs_overview(statistics: Statistics) -> Figure:
         nis_over_time([("all runs", statistics)], axes[2])
     else:
         axes[2].set_visible(False)
-    style.legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
+    style.legend_below(figure, [ax for ax in axes if ax.get_visible()], ncols=4)
     return figure
 
 
@@ -158,13 +160,13 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
     return ax
 
 
-def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None) -> Axes:
+def covariance_ellipses(claimed: Array, actual: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None) -> Axes:
     """Draw the 95 % ellipses of the errors of two states: by the filter's covariance, and of the actual errors."""
     from scipy.stats import chi2
 
     ax = style.axes_or_new(ax)
     i, j = pair
-    largest = np.sqrt(max(claimed[i, i], found[i, i])), np.sqrt(max(claimed[j, j], found[j, j]))
+    largest = np.sqrt(max(claimed[i, i], actual[i, i])), np.sqrt(max(claimed[j, j], actual[j, j]))
     alike = i // 3 == j // 3  # two angles, or two rates: the same unit
     (unit_i, size_i), (unit_j, size_j) = (
         state_unit(s, 3.0 * np.array(largest if alike else [x])) for s, x in zip(pair, largest, strict=True)
@@ -173,7 +175,7 @@ def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0
     reach = float(np.sqrt(chi2.ppf(0.95, 2)))
     styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
         ("filter", claimed, {"edgecolor": style.VERMILION, "linewidth": 2.0}),
-        ("actual errors", found, {"edgecolor": style.ink(), "linewidth": 1.2, "linestyle": "--"}),
+        ("actual errors", actual, {"edgecolor": style.ink(), "linewidth": 1.2, "linestyle": "--"}),
     )
     for name, matrix, look in styles:
         P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)

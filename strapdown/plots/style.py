@@ -175,8 +175,8 @@ def legend_above(ax: Axes, *, ncols: int = 4) -> None:
 
 def legend_below(figure: Figure, axes: Sequence[Axes], *, ncols: int = 4) -> None:
     """Put one legend for several axes, each label once, below a figure."""
-    found = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=ncols, frameon=False)
+    handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=ncols, frameon=False)
 
 
 ALIKE = 2.0
@@ -187,8 +187,8 @@ def match_scales(axes: Sequence[Axes]) -> None:
     """Give adjacent axes the same vertical scale unless it would hide a curve, and mark those with a larger scale."""
     spans = np.array([float(np.ptp(ax.get_ylim())) for ax in axes])
     alike = spans < ALIKE * spans.min()
-    for ax, span, one in zip(axes, spans, alike, strict=True):
-        if one:
+    for ax, span, is_alike in zip(axes, spans, alike, strict=True):
+        if is_alike:
             ax.set_ylim(np.array(ax.get_ylim()) * (spans[alike].max() / span))
         else:
             ratio = span / spans[alike].max()

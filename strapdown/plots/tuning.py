@@ -20,23 +20,23 @@ TALLEST = 15.0
 def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | None = None) -> Axes:
     """Draw twice the decrease of the log-likelihood along one parameter, with its interval and its previous value."""
     ax = style.axes_or_new(ax)
-    one = tuning.parameters[number]
-    unit = one.unit
+    parameter = tuning.parameters[number]
+    unit = parameter.unit
     values = slices.values[number] / unit.factor
     ax.semilogx(values, slices.fallen[number], color=style.BLUE, linewidth=1.4)
     if not tuning.composite:
         ax.axhline(3.84, color=style.ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
-    lower, upper = max(one.lower / unit.factor, values[0]), min(one.upper / unit.factor, values[-1])
+    lower, upper = max(parameter.lower / unit.factor, values[0]), min(parameter.upper / unit.factor, values[-1])
     ax.axvspan(
         lower,
         upper,
         color=style.SKY,
         alpha=0.3,
         linewidth=0,
-        label="95 % interval" if one.identified else "below the 95 % bound",
+        label="95 % interval" if parameter.identified else "below the 95 % bound",
     )
-    ax.axvline(one.value / unit.factor, color=style.BLUE, linewidth=0.8, label="tuned")
-    before = one.start / unit.factor
+    ax.axvline(parameter.value / unit.factor, color=style.BLUE, linewidth=0.8, label="tuned")
+    before = parameter.start / unit.factor
     drawn = values[0] <= before <= values[-1]
     if drawn:
         ax.axvline(before, color=style.VERMILION, linewidth=1.0, linestyle="--", label="before")
@@ -49,7 +49,7 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
     if values[-1] < 100.0 * values[0]:
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
     ax.set_ylim(0.0, TALLEST)
-    ax.set_title(one.name)
+    ax.set_title(parameter.name)
     ax.set_xlabel(unit.name if drawn else f"{unit.name}  (before: {before:.3g})")
     return ax
 
@@ -80,9 +80,9 @@ def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
     figure, axes = style.new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
     for number, (of, _, _, bounds) in enumerate(comparison.after.courses):
         courses = []
-        for name, one, color in both:
-            _, time, mean, _ = one.courses[number]
-            courses.append((name, color, float(np.nanmean(mean)) if number else one.nis, time, mean))
+        for name, performance, color in both:
+            _, time, mean, _ = performance.courses[number]
+            courses.append((name, color, float(np.nanmean(mean)) if number else performance.nis, time, mean))
         _course(axes[number, 0], courses, bounds, of)
     figure.suptitle(title)
     axes[-1, 0].set_xlabel("time, s")
@@ -97,8 +97,8 @@ def _course(
         there = np.isfinite(values)
         ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")
     ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
-    seen = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
-    if seen.max() > 5.0 or seen.min() < 0.2:
+    finite = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
+    if finite.max() > 5.0 or finite.min() < 0.2:
         style.log_scale(ax)
         label += " (log scale)"
     ax.axhline(1.0, color=style.ink(), linewidth=0.6, linestyle=":")

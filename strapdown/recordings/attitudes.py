@@ -120,19 +120,19 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
 
 
 def _read(file: Path, topic: str) -> Attitudes:
-    found = formats.format_of(file).name
-    if found == "ROS bag":
+    format_name = formats.format_of(file).name
+    if format_name == "ROS bag":
         return _bag(file, topic)
     if topic:
         raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
-    if found == "BROAD" and (kind := reading.kind(file)):
+    if format_name == "BROAD" and (kind := reading.kind(file)):
         return _own(file, kind)
-    if found == "ULog":
+    if format_name == "ULog":
         return _ulog(file)
-    if found == "TUM trajectory":
+    if format_name == "TUM trajectory":
         stamps, q = trajectories.read_tum(file)
         return Attitudes(source=file.name, stamps_ns=stamps, attitude=q, remarks=("TUM trajectory: no covariance.",))
-    return _table(file) if found == "CSV" else _of_recording(formats.read(file, gyro_alone=True))
+    return _table(file) if format_name == "CSV" else _of_recording(formats.read(file, gyro_alone=True))
 
 
 def _whole_ns(time: Array) -> NDArray[np.int64]:
@@ -205,7 +205,7 @@ _PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
     table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
-    found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
+    named: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
     frames: set[str] = set()
     for place, cell in enumerate(table.header):
         for name, pattern in _PATTERNS.items():
@@ -216,26 +216,26 @@ def _table(path: Path) -> Attitudes:
             key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
             if parts.get("frame"):
                 frames.add(parts["frame"])
-            if key in found[name]:
+            if key in named[name]:
                 raise InputError(
-                    f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
+                    f"{path.name}: column {cell} has the same meaning as column {table.header[named[name][key][0]]}"
                 )
-            found[name][key] = (place, parts.get("unit") or "")
+            named[name][key] = (place, parts.get("unit") or "")
     if len(frames) > 1:
         raise InputError(
             f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
         )
-    if set(found["q"]) != set("wxyz") or not found["time"]:
+    if set(named["q"]) != set("wxyz") or not named["time"]:
         raise InputError(
-            f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
+            f"{path.name} lacks {'time' if not named['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
             f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
         )
-    time_place, time_unit = found["time"][""]
-    places = sorted({place for group in found.values() for place, _ in group.values()})
+    time_place, time_unit = named["time"][""]
+    places = sorted({place for group in named.values() for place, _ in group.values()})
     numbers = table.load(places, time_place)
     whole = table.clock_ns(time_place)
     columns = {
-        name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in found.items()
+        name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in named.items()
     }
     if whole is not None:
         stamps = np.rint(whole[0] * 1e9).astype(np.int64) + whole[1]
@@ -278,12 +278,12 @@ def _covariance(
     name: str, columns: Mapping[str, Mapping[str, tuple[Array, str]]], m: int
 ) -> tuple[Array | None, str, list[str]]:
     """Return the covariance from the columns, the kind of angles it describes (empty if not named), and remarks."""
-    given = columns["cov"]
-    if given:
-        size = 6 if any("b" in key for key in given) else 3
+    cov_columns = columns["cov"]
+    if cov_columns:
+        size = 6 if any("b" in key for key in cov_columns) else 3
         P = np.full((m, size, size), np.nan)
-        for key, (value, unit) in given.items():
-            i, j = (_STATES.index(one) for one in key.split())
+        for key, (value, unit) in cov_columns.items():
+            i, j = (_STATES.index(state) for state in key.split())
             P[:, i, j] = P[:, j, i] = value * (DEGREE**2 if unit == "deg2" else 1.0)
         if np.isnan(P).any(axis=0).any():
             i, j = np.argwhere(np.isnan(P).any(axis=0))[0]
@@ -316,16 +316,16 @@ def _unit(name: str, q: Array) -> Array:
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
     topics, _, words = ros.topics_of(path, ros.ORIENTED)
-    chosen = _topic(path.name, topics, topic)
-    number = len(topics[chosen])
-    stamps, values, order_words = topics[chosen].decoded(path.name)
+    chosen_topic = _topic(path.name, topics, topic)
+    number = len(topics[chosen_topic])
+    stamps, values, order_words = topics[chosen_topic].decoded(path.name)
     q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
     known = q.any(axis=1) & (P[:, 0] != -1.0 if P.size else True)
     if known.sum() < 2:
-        raise InputError(f"{path.name}: topic {chosen} has no orientation in its {number} messages")
+        raise InputError(f"{path.name}: topic {chosen_topic} has no orientation in its {number} messages")
     stamps, q, P = stamps[known], q[known], P[known]
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
-    remarks = [f"Topic {chosen}: {int(fresh.sum())} orientations of {number} messages.", *words, *order_words]
+    remarks = [f"Topic {chosen_topic}: {int(fresh.sum())} orientations of {number} messages.", *words, *order_words]
     covariance = None
     if P.any():
         covariance = (P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3))[fresh]
@@ -340,15 +340,15 @@ def _bag(path: Path, topic: str) -> Attitudes:
     )
 
 
-def _topic(name: str, found: Mapping[str, ros.Topic], topic: str) -> str:
-    if not found:
+def _topic(name: str, topics: Mapping[str, ros.Topic], topic: str) -> str:
+    if not topics:
         raise InputError(f"{name} has no topic of {', '.join(kind.rpartition('/')[2] for kind in ros.ORIENTED)}")
     if topic:
-        return one_of(f"{name}: topic", topic, found)
-    if len(found) > 1:
-        listed = ", ".join(f"{t} ({c.kind.rpartition('/')[2]}, {len(c)} messages)" for t, c in found.items())
+        return one_of(f"{name}: topic", topic, topics)
+    if len(topics) > 1:
+        listed = ", ".join(f"{t} ({c.kind.rpartition('/')[2]}, {len(c)} messages)" for t, c in topics.items())
         raise InputError(f"{name} has several topics with orientations: {listed}; choose one by {Hint('topic')}")
-    return next(iter(found))
+    return next(iter(topics))
 
 
 # -------------------------------------------------------------------------------------------------------------- ULog
@@ -360,7 +360,11 @@ _INNOVATIONS, _VARIANCES = "estimator_innovations", "estimator_innovation_varian
 def _ulog(path: Path) -> Attitudes:
     """Read the attitude estimated by PX4, body axes forward, right, down, transformed to East-North-Up, and its innovations."""
     log = ulog.opened(path, [_STATES_TOPIC, ulog.ATTITUDE, _INNOVATIONS, _VARIANCES])
-    data = {one.name: one.data for one in log.data_list if one.multi_id == 0 and len(one.data["timestamp"]) > 1}
+    data = {
+        dataset.name: dataset.data
+        for dataset in log.data_list
+        if dataset.multi_id == 0 and len(dataset.data["timestamp"]) > 1
+    }
     remarks: list[str] = []
     covariance = None
     if _STATES_TOPIC in data:
@@ -369,7 +373,7 @@ def _ulog(path: Path) -> Attitudes:
         ned = _unit(path.name, ulog.columns(rows, "states", 4)[kept])
         number = sum(name.startswith("covariances[") for name in rows)
         if number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq
-            xi = np.stack([_quaternion_columns(one) for one in ned])
+            xi = np.stack([_quaternion_columns(dataset) for dataset in ned])
             variance = ulog.columns(rows, "covariances", 4)[kept]
             covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, variance, xi)
             remarks.append(
@@ -420,12 +424,12 @@ def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], f
     for name in values:
         if not name.startswith("timestamp") and name in variances:
             fields.setdefault(name.partition("[")[0], []).append(name)
-    found = {}
+    innovations = {}
     for name, parts in fields.items():
         e = np.stack([np.asarray(values[part], np.float64)[rows] for part in parts], axis=1)
         s = np.stack([np.asarray(variances[part], np.float64)[other] for part in parts], axis=1)
         new = np.isfinite(e).all(axis=1) & np.isfinite(s).all(axis=1) & (s > 0.0).all(axis=1)
         new &= np.concatenate([[True], np.any(np.diff(e, axis=0) != 0.0, axis=1)])
         if new.sum() > 1:
-            found[name] = Innovations(time=(at[rows][new] - first) / 1e6, innovation=e[new], variance=s[new])
-    return found
+            innovations[name] = Innovations(time=(at[rows][new] - first) / 1e6, innovation=e[new], variance=s[new])
+    return innovations

@@ -45,9 +45,9 @@ def storages(path: Path) -> list[Path]:
     """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
     name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
     endings = "|".join(map(re.escape, _ENDINGS))
-    numbers = {one: re.fullmatch(rf"{name}(?:_(\d{{1,9}}))?({endings})", one.name) for one in path.iterdir()}
+    numbers = {file: re.fullmatch(rf"{name}(?:_(\d{{1,9}}))?({endings})", file.name) for file in path.iterdir()}
     return sorted(
-        (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
+        (file for file, number in numbers.items() if number), key=lambda file: int((numbers[file] or [0, 0])[1] or 0)
     )
 
 
@@ -75,7 +75,7 @@ class Bag:
         if self.with_metadata:
             named = re.findall(r"^\s*-\s+['\"]?(\S+?)['\"]?\s*$", reading.text(metadata), re.MULTILINE)
             names = {name.rpartition("/")[2] for name in named if name.endswith(_ENDINGS)}
-            missing = sorted(names - {one.name for one in self.files})
+            missing = sorted(names - {file.name for file in self.files})
             self.faults += [f"{', '.join(missing)} of its metadata.yaml is missing"] if missing else []
 
     def read(self, receiver: Callable[[str, str], Add | None]) -> None:

@@ -111,22 +111,22 @@ def unit_of(group: str, text: str) -> str:
         return plain
     squeezed = re.sub(r"[\s_·*.]", "", plain).lower()
     small = {unit.lower(): unit for unit in UNITS[group]}
-    found = _SPELLINGS[group].get(squeezed) or (squeezed if squeezed in UNITS[group] else "")
-    return found or ("" if group == "magnetometer" else small.get(squeezed, ""))
+    spelled = _SPELLINGS[group].get(squeezed) or (squeezed if squeezed in UNITS[group] else "")
+    return spelled or ("" if group == "magnetometer" else small.get(squeezed, ""))
 
 
 def parse_mapping(text: str) -> dict[str, str]:
     """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, that of the command line."""
-    found: dict[str, str] = {}
+    mapping: dict[str, str] = {}
     for part in text.split(","):
         role, equals, name = part.partition("=")
         role = role.strip()
         if not equals or not name.strip():
             raise InputError(f"columns: {part.strip()!r} is not ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
-        if role in found:
+        if role in mapping:
             raise InputError(f"columns: {role} is given twice; keep one")
-        found[role] = name.strip()
-    return found
+        mapping[role] = name.strip()
+    return mapping
 
 
 def recording(
@@ -146,11 +146,11 @@ def recording(
     header declares none. ``mapping`` gives columns by role, optionally with a unit, ``{"gx": "gyro_x [dps]"}``; the others are found by
     their names.
     """
-    for name, given in (("units", units or {}), ("columns", mapping or {})):
-        instance(name, given, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
+    for name, value in (("units", units or {}), ("columns", mapping or {})):
+        instance(name, value, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
-    names = Counter(one.name.lower() for one in columns if one.name)
+    names = Counter(column.name.lower() for column in columns if column.name)
     if twice := [name for name, number in names.items() if number > 1]:
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     roles, declared, remark = _roles(source, columns, mapping or {})
@@ -160,15 +160,15 @@ def recording(
         missing = [role for role in members if role not in roles]
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
             raise InputError(
-                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(one.name for one in columns)}); name the columns, as "
-                f"in {Hint('columns', {missing[0]: 'NAME'})}"
+                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in columns)}); "
+                f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
             )
     present = {_group(role) for role in roles}
-    chosen = _units(source, present, declared, units or {})
+    unit_of_group = _units(source, present, declared, units or {})
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__
     _need_digits(source, values, roles)
     stamps = clock_ns(roles["time"])
-    time, epoch = _seconds(values(roles["time"]), TIME_UNITS[chosen["time"]]) if stamps is None else stamps
+    time, epoch = _seconds(values(roles["time"]), TIME_UNITS[unit_of_group["time"]]) if stamps is None else stamps
     if "time" not in declared and not (units or {}).get("time"):
         _need_time_unit(source, columns[roles["time"]].name, time)
 
@@ -177,10 +177,10 @@ def recording(
 
     own: dict[str, Any] = {}
     if "accelerometer" in present:
-        own["specific_force"] = triple("accelerometer", FORCE_UNITS[chosen["accelerometer"]])
+        own["specific_force"] = triple("accelerometer", FORCE_UNITS[unit_of_group["accelerometer"]])
     if "magnetometer" in present:
         own["magnetic_field"] = triple("magnetometer", 1.0)
-        own["magnetic_unit"] = chosen["magnetometer"]
+        own["magnetic_unit"] = unit_of_group["magnetometer"]
     if "temperature" in present:
         own["temperature"] = values(roles["temperature"])
     if "reference" in present:
@@ -190,7 +190,7 @@ def recording(
     return with_gyro(
         source=source,
         time=time,
-        rate=triple("gyro", RATE_UNITS[chosen["gyro"]]),
+        rate=triple("gyro", RATE_UNITS[unit_of_group["gyro"]]),
         epoch_ns=epoch,
         remarks=(remark,) if remark else (),
         **own,
@@ -205,19 +205,19 @@ def _roles(
     source: str, columns: Sequence[Column], mapping: Mapping[str, str]
 ) -> tuple[dict[str, int], dict[str, str], str]:
     """Return the column of each role, the declared unit of each group, and a remark on guessed columns."""
-    names = [one.name.lower() for one in columns]
+    names = [column.name.lower() for column in columns]
     unit_by_role: dict[str, str] = {}
     roles: dict[str, int] = {}
     for role, cell in mapping.items():
         one_of("columns: role", role, [role for members in GROUPS.values() for role in members])
         wanted = column(cell)
-        cells = {one.said.lower(): k for k, one in enumerate(columns)} | {name: k for k, name in enumerate(names)}
-        found = cells.get(cell.lower(), cells.get(wanted.name.lower()))
-        if found is None:
+        cells = {column.said.lower(): k for k, column in enumerate(columns)} | {name: k for k, name in enumerate(names)}
+        index = cells.get(cell.lower(), cells.get(wanted.name.lower()))
+        if index is None:
             raise InputError(
                 f"{source} has no column {cell!r} for {role} (it has: {', '.join(c.name for c in columns)})"
             )
-        roles[role] = found
+        roles[role] = index
         if wanted.unit and cell.lower() not in names:
             unit_by_role[role] = wanted.unit
     guessed: list[str] = []
@@ -259,18 +259,18 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
     if group == "time":
         return _guess_time(columns)
     if group == "temperature":
-        hits = [k for k, one in enumerate(columns) if _words(one.name)[:1] in (["temp"], ["temperature"])]
+        hits = [k for k, column in enumerate(columns) if _words(column.name)[:1] in (["temp"], ["temperature"])]
         usable = len(hits) == 1 and unit_of("temperature", columns[hits[0]].unit or _end(columns[hits[0]].name))
         return ((hits[0],), "degC") if usable else None
     if group not in SENSORS:
         return None
-    found: dict[tuple[str, ...], dict[int, tuple[int, str]]] = {}
-    for k, one in enumerate(columns):
-        parted = _axis(group, one.name)
+    groups: dict[tuple[str, ...], dict[int, tuple[int, str]]] = {}
+    for k, column in enumerate(columns):
+        parted = _axis(group, column.name)
         if parted is not None:
             prefix, axis, unit = parted
-            found.setdefault(prefix, {})[axis] = (k, unit)
-    whole = [(prefix, axes) for prefix, axes in found.items() if len(axes) == 3]
+            groups.setdefault(prefix, {})[axis] = (k, unit)
+    whole = [(prefix, axes) for prefix, axes in groups.items() if len(axes) == 3]
     if len(whole) > 1:
         said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
         role = GROUPS[group][0]
@@ -314,15 +314,15 @@ def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
 
 def _guess_time(columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None:
     for wanted in _TIMES:
-        for k, one in enumerate(columns):
-            words = _words(one.name)
+        for k, column in enumerate(columns):
+            words = _words(column.name)
             size = len(wanted.split())
             if " ".join(words[:size]) == wanted:
                 unit = unit_of("time", "".join(words[size:])) if words[size:] else ""
                 if unit or not words[size:]:
                     return (k,), unit
     # loggingTime(ms), Time since start in ms: if only one column is a time
-    hits = [k for k, one in enumerate(columns) if {"time", "timestamp"} & set(_words(one.name))]
+    hits = [k for k, column in enumerate(columns) if {"time", "timestamp"} & set(_words(column.name))]
     return ((hits[0],), unit_of("time", _end(columns[hits[0]].name))) if len(hits) == 1 else None
 
 
@@ -332,14 +332,14 @@ def _end(name: str) -> str:
 
 
 def _units(
-    source: str, present: Collection[str], declared: Mapping[str, str], given: Mapping[str, str]
+    source: str, present: Collection[str], declared: Mapping[str, str], options: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the unit of each group of columns in the table; empty for a magnetometer without a declared unit."""
-    chosen: dict[str, str] = {}
+    result: dict[str, str] = {}
     for group, units in UNITS.items():
         if group not in present:
             continue
-        option = given.get(group, "")
+        option = options.get(group, "")
         option = unit_of(group, option) or option
         unit = option or declared.get(group) or {"time": "s", "temperature": "degC"}.get(group, "")
         if not unit and group != "magnetometer":
@@ -352,8 +352,8 @@ def _units(
             raise InputError(
                 f"{source}: the header declares {declared[group]} for the {group}, but the option is {option}; drop one"
             )
-        chosen[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
-    return chosen
+        result[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
+    return result
 
 
 SHORT_STAMPS = 0.1

@@ -36,12 +36,12 @@ def from_table(
 
     ``source`` is its name in messages; options as for :func:`strapdown.read`.
     """
-    found = _columns(source, table)
-    names, arrays = list(found), list(found.values())
-    for name, one in found.items():
-        if np.shape(one) != np.shape(arrays[0]) or np.ndim(one) != 1:
+    held = _columns(source, table)
+    names, arrays = list(held), list(held.values())
+    for name, column in held.items():
+        if np.shape(column) != np.shape(arrays[0]) or np.ndim(column) != 1:
             raise InputError(
-                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give arrays (n,) or "
+                f"{source}: column {name} has shape {np.shape(column)}, the first {np.shape(arrays[0])}; give arrays (n,) or "
                 "(n, 3) of one length"
             )
 
@@ -84,20 +84,20 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
                 f"{source} is an array without names of columns; give a structured array or arrays by name"
             )
         table = {name: table[name] for name in table.dtype.names}
-    found: dict[str, NDArray[np.generic]] = {}
+    columns: dict[str, NDArray[np.generic]] = {}
     if hasattr(table, "columns"):  # a DataFrame
         index = table.index
         if (index.name or getattr(index, "tz", None) is not None or np.asarray(index).dtype.kind in "mM") and not (
             {"time", index.name} & {str(name) for name in table.columns}
         ):
-            found[str(index.name or "time")] = _plain(index)
-        found |= {str(name): _plain(table[name]) for name in table.columns}
+            columns[str(index.name or "time")] = _plain(index)
+        columns |= {str(name): _plain(table[name]) for name in table.columns}
     else:
         for name, values in dict(table).items():
-            found |= _by_axis(str(name), _unmasked(values))
-    if not found:
+            columns |= _by_axis(str(name), _unmasked(values))
+    if not columns:
         raise InputError(f"{source} has no columns; give time, gx, gy, gz, …")
-    return found
+    return columns
 
 
 def _plain(series: Any) -> NDArray[np.generic]:
@@ -134,15 +134,15 @@ def _by_axis(name: str, values: NDArray[np.generic]) -> dict[str, NDArray[np.gen
 
 
 def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
-    found: dict[str, NDArray[np.generic]] = {}
+    columns: dict[str, NDArray[np.generic]] = {}
     for name, variable in {**table.coords, **table.data_vars}.items():
         unit = str(variable.attrs.get("units", variable.attrs.get("unit", "")))
         values = np.asarray(variable.values)
         declared = f" [{unit}]" if unit and values.dtype.kind not in "mM" else ""
         if (values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis") or values.shape[1:] == (3,):
-            found |= _by_axis(f"{name}{declared}", values)
-    length = max((len(values) for values in found.values()), default=0)
-    return {name: values for name, values in found.items() if len(values) == length}
+            columns |= _by_axis(f"{name}{declared}", values)
+    length = max((len(values) for values in columns.values()), default=0)
+    return {name: values for name, values in columns.items() if len(values) == length}
 
 
 def read_parquet(
@@ -166,11 +166,11 @@ def read_parquet(
 
 def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:
     """Return the columns of an Arrow table, with units from the metadata of their fields; nulls are NaN or NaT."""
-    found: dict[str, NDArray[np.generic]] = {}
+    columns: dict[str, NDArray[np.generic]] = {}
     for entry, chunks in zip(table.schema, table.columns, strict=True):
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
-        found[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
-    return found
+        columns[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
+    return columns
 
 
 def _is_number(kind: Any) -> bool:
@@ -181,20 +181,20 @@ def _is_number(kind: Any) -> bool:
 
 def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording as Parquet, with its units as metadata of the fields."""
-    found, unit = recording_columns(recording)
-    write_parquet_columns(path, found, unit)
+    columns, unit = recording_columns(recording)
+    write_parquet_columns(path, columns, unit)
 
 
 def write_parquet_columns(
-    path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]], units: Mapping[str, str] | None = None
+    path: str | os.PathLike[str], columns: Mapping[str, NDArray[np.generic]], units: Mapping[str, str] | None = None
 ) -> None:
     """Write columns as Parquet, with units as metadata of the fields."""
     arrow = library("pyarrow", f"writing {Path(path).name}")
     parquet = library("pyarrow.parquet", f"writing {Path(path).name}")
-    arrays = [arrow.array(np.ascontiguousarray(values)) for values in found.values()]
+    arrays = [arrow.array(np.ascontiguousarray(values)) for values in columns.values()]
     fields = [
         arrow.field(name, values.type, metadata={"unit": unit} if (unit := (units or {}).get(name)) else None)
-        for name, values in zip(found, arrays, strict=True)
+        for name, values in zip(columns, arrays, strict=True)
     ]
     with atomic_write(path) as temporary:
         table = arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))

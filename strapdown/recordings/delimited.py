@@ -177,9 +177,9 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
     names, before = [], ""
     for a, b in zip(first, second, strict=True):
         before = a.strip() or before
-        one = naming.column(before)
-        name = f"{one.name} {b.strip()}".strip()
-        names.append(f"{name} [{one.unit}]" if one.unit and "[" not in b else name)
+        column = naming.column(before)
+        name = f"{column.name} {b.strip()}".strip()
+        names.append(f"{name} [{column.unit}]" if column.unit and "[" not in b else name)
     return names
 
 
@@ -201,7 +201,7 @@ def is_number(cell: str) -> bool:
 def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
     """Return the data of a recording as columns by the package's names, and the units of the columns that have one."""
     clock = bool(recording.epoch_ns)
-    found: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
+    columns: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
     unit = {"time": "ns" if clock else "s"}
     triples = {
         "gyro": (recording.rate, "rad/s"),
@@ -213,27 +213,27 @@ def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generi
     }
     for group, (values, name) in triples.items():
         if values is not None:
-            found |= {role: values[:, k] for k, role in enumerate(naming.GROUPS[group])}
+            columns |= {role: values[:, k] for k, role in enumerate(naming.GROUPS[group])}
             unit |= dict.fromkeys(naming.GROUPS[group], name) if name else {}
-    return found, unit
+    return columns, unit
 
 
 def write_csv(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording as CSV (as TSV if the extension is ``.tsv``), so that :func:`read_csv` gives the same numbers."""
-    found, unit = recording_columns(recording)
-    names = [f"{name} [{unit[name]}]" if name in unit else name for name in found]
-    write_columns(path, dict(zip(names, found.values(), strict=True)))
+    columns, unit = recording_columns(recording)
+    names = [f"{name} [{unit[name]}]" if name in unit else name for name in columns]
+    write_columns(path, dict(zip(names, columns.values(), strict=True)))
 
 
-def write_columns(path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]]) -> None:
+def write_columns(path: str | os.PathLike[str], columns: Mapping[str, NDArray[np.generic]]) -> None:
     """Write columns of numbers as text, with 17 digits per number, integers as integers; NaN is an empty field."""
     separator = "\t" if Path(path).suffix.lower() == ".tsv" else ","
     texts = []
-    for column in found.values():
+    for column in columns.values():
         if column.dtype.kind in "iu":
             texts.append([str(x) for x in column.tolist()])
         else:
             texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        file.write(separator.join(found) + "\n")
+        file.write(separator.join(columns) + "\n")
         file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

@@ -146,19 +146,25 @@ def format_of(path: str | os.PathLike[str]) -> Format:
         with reading.opened(file) as stream:
             head = stream.read(HEAD)
     table = FORMATS[-1]
-    found = next((one for one in FORMATS if one is not table and one.recognised(file, head)), None)
-    if found is not None:
-        return found
+    recognised = next(
+        (candidate for candidate in FORMATS if candidate is not table and candidate.recognised(file, head)), None
+    )
+    if recognised is not None:
+        return recognised
     if file.is_dir():
         raise InputError(
             f"{path} is a folder; name the file in it (folders that can be read: a ROS 2 bag, or EuRoC with imu0/data.csv)"
         )
-    by_ending = next((one for one in FORMATS if file.suffix.lower() in one.endings), None)
+    by_ending = next((candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings), None)
     if by_ending is not None:
         return by_ending
     if table.recognised(file, head):
         return table
-    known = (f"{one.name} ({' or '.join(one.endings)})" if one.endings else one.name for one in FORMATS if one.read)
+    known = (
+        f"{candidate.name} ({' or '.join(candidate.endings)})" if candidate.endings else candidate.name
+        for candidate in FORMATS
+        if candidate.read
+    )
     raise InputError(
         f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {', '.join(known)}"
     )
@@ -182,26 +188,26 @@ def read(
 ) -> Recording:
     """Read a recording of any format, recognised by its content: a file, or a folder; options as for :func:`strapdown.read`."""
     file = Path(path)
-    found = format_of(file)
-    if not found.read:
+    file_format = format_of(file)
+    if not file_format.read:
         raise InputError(
-            f"{file.name} is a {found.name}, which has no inertial samples; give the recording, and this file as its reference"
+            f"{file.name} is a {file_format.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
-    given = {"units": units or {}, "columns": columns or {}, "topic": topic}
+    choices = {"units": units or {}, "columns": columns or {}, "topic": topic}
     needed = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}
-    for name, value in given.items():
-        if value and name not in found.options and name in needed:
-            raise InputError(f"{file.name} ({found.name}): {needed[name]}; drop the option")
-        if value and name not in found.options:
-            said = found.name if found.name != "BROAD" else "HDF5"
+    for name, value in choices.items():
+        if value and name not in file_format.options and name in needed:
+            raise InputError(f"{file.name} ({file_format.name}): {needed[name]}; drop the option")
+        if value and name not in file_format.options:
+            said = file_format.name if file_format.name != "BROAD" else "HDF5"
             raise InputError(
                 f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
             )
-    options: dict[str, Any] = {name: value for name, value in given.items() if name in found.options}
-    if "gyro_alone" in found.options:
+    options: dict[str, Any] = {name: value for name, value in choices.items() if name in file_format.options}
+    if "gyro_alone" in file_format.options:
         options["gyro_alone"] = gyro_alone
-    with reading.from_file(file, found.name):
-        recording: Recording = _function(found.read)(file, **options)
+    with reading.from_file(file, file_format.name):
+        recording: Recording = _function(file_format.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
 
 
@@ -220,8 +226,8 @@ def write(
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")
     if isinstance(content, Estimate):
-        found = estimate_format(path, options, recording=recording is not None)
-        _function(found.write_estimate)(content, Path(path), recording=recording, **options)
+        file_format = estimate_format(path, options, recording=recording is not None)
+        _function(file_format.write_estimate)(content, Path(path), recording=recording, **options)
     else:
         _function(_by_ending(path, "write").write)(content, Path(path), **options)
 
@@ -231,28 +237,32 @@ def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *
 
     ``options`` are the writer's options to be used; ``recording`` is whether there is a recording, whose samples some formats need.
     """
-    found = _by_ending(path, "write_estimate")
+    file_format = _by_ending(path, "write_estimate")
     for name in options:
-        if name not in found.estimate_options:
-            raise InputError(f"{path} ({found.name}) has no option {name}; leave it out, or choose another extension")
-    if found.with_samples and not recording:
+        if name not in file_format.estimate_options:
+            raise InputError(
+                f"{path} ({file_format.name}) has no option {name}; leave it out, or choose another extension"
+            )
+    if file_format.with_samples and not recording:
         raise InputError(
-            f"{path} ({found.name}) needs the samples too; give the recording that the estimate was made from, or choose another "
+            f"{path} ({file_format.name}) needs the samples too; give the recording that the estimate was made from, or choose another "
             "extension"
         )
-    return found
+    return file_format
 
 
 def writers(kind: str) -> tuple[str, ...]:
     """Return the file extensions that can be written; ``kind`` is ``"write"`` (recordings) or ``"write_estimate"``."""
-    return tuple(dict.fromkeys(ending for one in FORMATS if getattr(one, kind) for ending in one.endings))
+    return tuple(
+        dict.fromkeys(ending for file_format in FORMATS if getattr(file_format, kind) for ending in file_format.endings)
+    )
 
 
 def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
     ending = Path(path).suffix.lower()
-    for one in FORMATS:
-        if getattr(one, kind) and ending in one.endings:
-            return one
+    for file_format in FORMATS:
+        if getattr(file_format, kind) and ending in file_format.endings:
+            return file_format
     what = "an estimate" if kind == "write_estimate" else "a recording"
     raise InputError(
         f"{path} ends in {ending!r}, but {what} is written as {', '.join(writers(kind))}; choose one of these extensions"

@@ -42,10 +42,10 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     lag = max(1, round(SPAN / interval))
     if causal:
         others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
-        constants, found = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
-        rows = (read_only(one) for one in (field, frame, known, time))
-        compiled(headings.iron_steps)(constants, *rows, strength, memory(lag, 1), found)
-        return found
+        constants, result = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
+        rows = (read_only(column) for column in (field, frame, known, time))
+        compiled(headings.iron_steps)(constants, *rows, strength, memory(lag, 1), result)
+        return result
     if len(time) <= lag:
         return np.zeros((len(time), 3))
     now, then = quaternion.conjugate(frame[lag:]), quaternion.conjugate(frame[:-lag])

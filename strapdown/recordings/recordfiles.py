@@ -125,8 +125,14 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
         with contextlib.suppress(InputError):
             scenario = scenario_to_toml(origin.scenario)
     spec = None if origin.gyro is None else json.dumps(gyro.to_table(origin.gyro))
-    made = {"gyro": spec, "scenario": scenario, "seed": origin.seed, "run": origin.run, "source": origin.source or None}
-    return {name: value for name, value in made.items() if value is not None}
+    attributes = {
+        "gyro": spec,
+        "scenario": scenario,
+        "seed": origin.seed,
+        "run": origin.run,
+        "source": origin.source or None,
+    }
+    return {name: value for name, value in attributes.items() if value is not None}
 
 
 def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, source: str = "") -> Origin | None:
@@ -134,21 +140,21 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
 
     ``source`` is that of an origin whose attributes do not name one.
     """
-    made: dict[str, Any] = {
+    origin: dict[str, Any] = {
         name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
     if "gyro" in attributes:
-        made["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")
-    if made or attributes.keys() & {"scenario", "source"}:
-        made["source"] = str(attributes.get("source", source))
+        origin["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")
+    if origin or attributes.keys() & {"scenario", "source"}:
+        origin["source"] = str(attributes.get("source", source))
     if "scenario" in attributes:
         from strapdown.scenarios import scenario_from_toml  # imported late, because it imports every motion
 
         if not isinstance(attributes["scenario"], str):
             raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
-        made["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
-        made.setdefault("gyro", made["scenario"].gyro)
-    return Origin(**made) if made else None
+        origin["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
+        origin.setdefault("gyro", origin["scenario"].gyro)
+    return Origin(**origin) if origin else None
 
 
 def _values(group: Any, name: str, unit: str) -> Array:

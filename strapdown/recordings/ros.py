@@ -129,17 +129,17 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     file = Path(path)
     topics, _, remarks = topics_of(file, READ)
-    chosen = _chosen(file.name, topics, topic)
-    stamps, values, order_words = topics[chosen].decoded(file.name)
-    said = [f"Topic {chosen}: {len(stamps)} messages.", *remarks, *order_words]
+    topic_name = _chosen(file.name, topics, topic)
+    stamps, values, order_words = topics[topic_name].decoded(file.name)
+    said = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks, *order_words]
     if values[0, 3] == -1.0:
         raise InputError(
-            f"{file.name}, topic {chosen}: message 1 declares that it has no angular velocity; choose another topic"
+            f"{file.name}, topic {topic_name}: message 1 declares that it has no angular velocity; choose another topic"
         )
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(chosen, [t for t in topics.values() if t.kind == kind and len(t)])
+        other = _beside(topic_name, [t for t in topics.values() if t.kind == kind and len(t)])
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
@@ -176,15 +176,15 @@ def _chosen(name: str, topics: Mapping[str, Topic], topic: str) -> str:
     return filled[0]
 
 
-def _beside(unit: str, found: list[Topic]) -> Topic | str | None:
+def _beside(unit: str, candidates: list[Topic]) -> Topic | str | None:
     """Return the topic of a kind that belongs to an inertial unit: the only one, or the only one of its namespace; else a remark."""
-    if len(found) <= 1:
-        return found[0] if found else None
+    if len(candidates) <= 1:
+        return candidates[0] if candidates else None
     space = unit.rpartition("/")[0] + "/"
-    near = [t for t in found if t.name.startswith(space)]
+    near = [t for t in candidates if t.name.startswith(space)]
     if len(near) == 1:
         return near[0]
-    names = ", ".join(t.name for t in found)
+    names = ", ".join(t.name for t in candidates)
     return f"None of {names} was read, because it is ambiguous which of them belongs to {unit}."
 
 
@@ -307,21 +307,21 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
         imu[:, 28] = -1.0
     else:
         imu[:, 25:28] = recording.specific_force
-    found: list[_Series] = [(IMU, stamps, imu)]
+    series: list[_Series] = [(IMU, stamps, imu)]
     if recording.magnetic_field is not None:
         known = ~np.isnan(recording.magnetic_field).any(axis=1)
         magnetic = np.zeros((int(known.sum()), DOUBLES[FIELD]))
         magnetic[:, :3] = field_in("T", recording)[known]
-        found.append((FIELD, stamps[known], magnetic))
+        series.append((FIELD, stamps[known], magnetic))
     if recording.temperature is not None:
         known = ~np.isnan(recording.temperature)
-        found.append(
+        series.append(
             (TEMPERATURE, stamps[known], np.stack([recording.temperature[known], np.zeros(known.sum())], axis=1))
         )
     if recording.true_attitude is not None:
         known = ~np.isnan(recording.true_attitude).any(axis=1)
-        found.append((REFERENCE, stamps[known], recording.true_attitude[known][:, [1, 2, 3, 0]]))
-    return found
+        series.append((REFERENCE, stamps[known], recording.true_attitude[known][:, [1, 2, 3, 0]]))
+    return series
 
 
 def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> None:
@@ -376,15 +376,15 @@ def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), ba
                 queue += [(stamp, connection, row.tobytes()) for stamp, row in zip(stamps.tolist(), rows, strict=True)]
             if bag is not None:
                 queue += _copied(writer, others, bag, store)
-            queue.sort(key=lambda one: one[0])
+            queue.sort(key=lambda message: message[0])
             for stamp, connection, data in queue:
                 writer.write(connection, stamp, data)
-        made = place if not ros2 else next(one for one in place.iterdir() if one.suffix == target.suffix.lower())
-        if made.suffix == ".mcap":
-            write_checksums(made)
+        written = place if not ros2 else next(item for item in place.iterdir() if item.suffix == target.suffix.lower())
+        if written.suffix == ".mcap":
+            write_checksums(written)
         if target.is_dir():
             raise InputError(f"{target} is a folder; choose another name")
-        shutil.move(made, target)
+        shutil.move(written, target)
 
 
 def _writer(place: Path, suffix: str, what: str) -> Any:

@@ -60,22 +60,22 @@ def read_samples(
     ``rate``, Hz, is only for an array, whose unit is ``units[sensor]``; other options as for :func:`strapdown.read`. ``gaps``: whether gaps
     are allowed: samples are then placed on a grid, and missing ones are NaN.
     """
-    file, given = Path(path), dict(units or {})
+    file, unit_of_sensor = Path(path), dict(units or {})
     one_of("sensor", sensor, SENSORS)
     if file.suffix.lower() == ".npy":
         reading.existing_file(file)
         with reading.from_file(file):
-            samples = _read_array(file, sensor, rate, given)
+            samples = _read_array(file, sensor, rate, unit_of_sensor)
     elif rate is not None:
         raise InputError(f"{file.name} states its own rate; drop the option rate")
     elif recordfiles.is_record(file):
-        if given:
+        if unit_of_sensor:
             raise InputError(
-                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
+                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(unit_of_sensor)}"
             )
         samples = samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
     else:
-        recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
+        recording = formats.read(file, units=unit_of_sensor, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
         samples = samples_of(recording, sensor, gaps=gaps)
     largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
     if samples.values.shape[1] not in (1, 3):
@@ -116,12 +116,12 @@ def samples_of(
     return _of_recording(formats.from_record(content, source), sensor, gaps)
 
 
-def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str, str]) -> GyroSamples:
+def _read_array(file: Path, sensor: str, rate: float | None, unit_of_sensor: Mapping[str, str]) -> GyroSamples:
     names = " or ".join(list(UNITS[sensor])[:2]) if sensor == "gyro" else " or ".join(UNITS[sensor])
-    if rate is None or sensor not in given:
+    if rate is None or sensor not in unit_of_sensor:
         raise InputError(f"{file.name} is an array without rate and unit; give its rate in Hz and its unit ({names})")
     values = reading.npy(file)
-    factor = UNITS[sensor][one_of(f"{file.name}: unit of the {sensor}", given[sensor], UNITS[sensor])]
+    factor = UNITS[sensor][one_of(f"{file.name}: unit of the {sensor}", unit_of_sensor[sensor], UNITS[sensor])]
     axes = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
     return GyroSamples(values=axes * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate")
 

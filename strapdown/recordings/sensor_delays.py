@@ -41,25 +41,25 @@ class Delays:
     """Delay of the magnetometer's stamps relative to the gyro's, s, negative for earlier: one number, or one per sample."""
     field_sigma: float
     """σ of the last value of ``field``, s; infinite if it is not observable."""
-    given: bool
-    """Whether the gyro's delay was given."""
+    is_specified: bool
+    """Whether the gyro's delay was specified by the user."""
 
     @property
     def words(self) -> tuple[str, ...]:
         """Description of the delays."""
         late, field = 1e3 * self.last_gyro, 1e3 * self.last_field
-        found = [
+        sentences = [
             f"Samples are assumed to be stamped {late:.3g} ms late."
-            if self.given
+            if self.is_specified
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
             f"if the delay is known, give {Hint('latency')} (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"
-            found.append(
+            sentences.append(
                 f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms, compensated."
             )
-        return tuple(found)
+        return tuple(sentences)
 
     @property
     def last_gyro(self) -> float:
@@ -90,7 +90,7 @@ def find(
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
         raise InputError(f"latency is {latency:g} s, and {recording.source} lasts {length:.3g} s")
-    found = np.full(len(recording.time), field or 0.0)
+    field_delay = np.full(len(recording.time), field or 0.0)
     sigma = GIVEN_SIGMA if field is not None else np.inf
     if field is None and recording.magnetic_field is not None:
         evidence = _evidence(recording, gyro_attitude(recording) if turned is None else turned)
@@ -102,15 +102,15 @@ def find(
             delay, sigma = _fitted(*(part[:until] for part in evidence[1:]))
             if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
                 since = recording.time[0] + span if causal else recording.time[0]
-                found[np.searchsorted(recording.time, since) :] = delay
+                field_delay[np.searchsorted(recording.time, since) :] = delay
     half = 0.5 * recording.interval
-    gyro: Array | float = np.maximum(half, -found) if latency is None else latency
+    gyro: Array | float = np.maximum(half, -field_delay) if latency is None else latency
     return Delays(
         gyro=gyro,
         sigma=ASSUMED_SIGMA if latency is None else GIVEN_SIGMA,
-        field=found,
+        field=field_delay,
         field_sigma=sigma,
-        given=latency is not None,
+        is_specified=latency is not None,
     )
 
 
@@ -147,8 +147,8 @@ def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array,
     lag = max(1, lag // stride)
     at = time[::stride]
     still, late, products = np.empty((len(at), 3)), np.empty((len(at), 3)), np.empty((len(at) - lag, 3))
-    given = (read_only(one) for one in (recording.rate, recording.magnetic_field, turned))
-    compiled(recording_samples.field_changes)(*given, stride, lag, still, late, products)
+    arrays = (read_only(column) for column in (recording.rate, recording.magnetic_field, turned))
+    compiled(recording_samples.field_changes)(*arrays, stride, lag, still, late, products)
     pairs = np.isfinite(products[:, 1])
     return at[lag:][pairs], *products[pairs].T.copy()
 
@@ -176,6 +176,6 @@ def turn_over(recording: Recording, delay: Array | float) -> Array:
     """
     late = np.broadcast_to(np.asarray(delay, np.float64), recording.time.shape)
     sums, turn = np.empty((2, len(late), 3))
-    given = (read_only(one) for one in (recording.time, recording.rate, late))
-    compiled(recording_steps.turn_over)(*given, sums, turn)
+    arrays = (read_only(column) for column in (recording.time, recording.rate, late))
+    compiled(recording_steps.turn_over)(*arrays, sums, turn)
     return turn

@@ -194,7 +194,7 @@ def _quantisation(rate: Array) -> float | None:
 
 def clipped_samples(samples: Array, least: float) -> np.ndarray:
     """Return a mask of the samples (n, 3) at the limit of their sensor: those that repeat the extreme of their axis, beyond ``least``."""
-    found = np.zeros(samples.shape, bool)
+    clipped = np.zeros(samples.shape, bool)
     ends = np.empty((3, 2, 2))
     compiled(recording_samples.extremes)(read_only(samples), ends)
     reached = (ends[:, :, 1] >= MIN_CLIPPED) & (np.abs(ends[:, :, 0]) >= least)
@@ -208,8 +208,8 @@ def clipped_samples(samples: Array, least: float) -> np.ndarray:
             continue
         for at, candidate in zip(extremes, repeated, strict=True):
             if candidate and np.any(at & same):
-                found[:, k] |= at
-    return found
+                clipped[:, k] |= at
+    return clipped
 
 
 def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:

@@ -46,14 +46,14 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
         if file.suffix.lower() != ending:  # a link with the extension that the library requires
             named = Path(folder) / f"{file.stem}{ending}"
             named.symlink_to(file.absolute())
-        found = parser.Parser(str(named))
-        rows: list[dict[str, Any]] = found.normalized_imu()
+        log = parser.Parser(str(named))
+        rows: list[dict[str, Any]] = log.normalized_imu()
     if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
         raise InputError(
-            f"{file.name} ({found.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"
+            f"{file.name} ({log.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"
         )
     time = np.array([row["timestamp_ms"] for row in rows], np.float64) / 1e3
-    device = " ".join(part for part in (found.camera, found.model) if part)
+    device = " ".join(part for part in (log.camera, log.model) if part)
     field = _columns(rows, "magn")
     return with_gyro(
         source=file.name,
@@ -81,5 +81,5 @@ def _triples(rows: list[dict[str, Any]], name: str) -> Array:
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Array | None:
     """Return a sensor's samples; None if there are none."""
-    found = _triples(rows, name)
-    return None if np.isnan(found).all() else found
+    triples = _triples(rows, name)
+    return None if np.isnan(triples).all() else triples

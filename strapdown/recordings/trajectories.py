@@ -34,7 +34,7 @@ TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 
 def _root(path: Path) -> Path | None:
     """Return the folder that contains imu0, from a data set's folder; None if there is none."""
-    return next((one for one in (path, path / "mav0") if (one / "imu0" / "data.csv").is_file()), None)
+    return next((folder for folder in (path, path / "mav0") if (folder / "imu0" / "data.csv").is_file()), None)
 
 
 def is_folder(path: Path) -> bool:
@@ -118,23 +118,23 @@ def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Record
 
 def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: Array, name: str) -> Recording:
     time = (stamps - recording.epoch_ns) / 1e9
-    found = interpolated(recording.time, time, quaternion.normalize(attitude))
-    known = int(np.sum(~np.isnan(found[:, 0])))
+    reference = interpolated(recording.time, time, quaternion.normalize(attitude))
+    known = int(np.sum(~np.isnan(reference[:, 0])))
     if not known:
         raise InputError(
             f"{name} goes from {time[0]:.3f} to {time[-1]:.3f} s of the recording's time and {recording.source} from "
             f"{recording.time[0]:.3f} to {recording.time[-1]:.3f} s; both must have the same clock"
         )
-    words = f"Reference of {name}: at {known} of {len(found)} stamps."
-    return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
+    words = f"Reference of {name}: at {known} of {len(reference)} stamps."
+    return replace(recording, true_attitude=reference, remarks=(*recording.remarks, words))
 
 
 def write_tum(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, frame: str = "ENU"
 ) -> None:
     """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
-    found = estimate.table(frame=frame)
-    q = np.stack([found[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
+    table = estimate.table(frame=frame)
+    q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
     stamps = np.rint(estimate.time * 1e9).astype(np.int64) + (0 if recording is None else recording.epoch_ns)
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write("# time tx ty tz qx qy qz qw\n")

@@ -46,22 +46,25 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a flight log."""
     file = Path(path)
     log = opened(file, [UNIT, FIELD, ATTITUDE, TRUTH])
-    data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
+    data = {
+        dataset.name if dataset.multi_id == 0 else f"{dataset.name}:{dataset.multi_id}": dataset.data
+        for dataset in log.data_list
+    }
     units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
     if not units:
         raise InputError(f"{file.name} has no message of {UNIT} (it has: {', '.join(data) or 'none that is read'})")
-    chosen = one_of(f"{file.name}: topic", topic or units[0], units)
-    stamps, order, remarks = in_order(chosen, data[chosen]["timestamp"])
-    remarks = [f"Topic {chosen}: {len(stamps)} messages.", *remarks]
+    topic_name = one_of(f"{file.name}: topic", topic or units[0], units)
+    stamps, order, remarks = in_order(topic_name, data[topic_name]["timestamp"])
+    remarks = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks]
     if _is_cut(file):
         remarks.append(f"{file.name} is truncated: only complete messages are read.")
     if log.file_corruption:
         remarks.append(f"{file.name} is damaged: only complete messages are read.")
     if log.dropouts:
-        lost = sum(one.duration for one in log.dropouts)
+        lost = sum(dropout.duration for dropout in log.dropouts)
         remarks.append(f"The logger lost {lost} ms in {len(log.dropouts)} dropouts.")
     time, epoch = relative_time(stamps * 1000)
-    rows = data[chosen]
+    rows = data[topic_name]
     rate = columns(rows, "gyro_rad", 3)[order]
     force = columns(rows, "accelerometer_m_s2", 3)[order]
     relative = np.asarray(rows.get("accelerometer_timestamp_relative", np.zeros(len(order))))[order]
@@ -168,9 +171,9 @@ def columns(rows: dict[str, Any], name: str, size: int) -> Array:
     return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
 
 
-def in_order(topic: str, given: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+def in_order(topic: str, timestamp: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
     """Return stamps, µs, in order, their rows, and remarks; of repeated stamps only the first is kept."""
-    stamps = np.asarray(given).astype(np.int64)
+    stamps = np.asarray(timestamp).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])
     words = []

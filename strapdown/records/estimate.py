@@ -180,16 +180,16 @@ def matrices(name: str, value: ArrayLike, m: int) -> Array:
     return symmetric(name, array(name, P, P.shape, allow_nan=True), SINGLE_ROUNDING)
 
 
-def _checked(sensor: str, given: Innovations) -> Innovations:
+def _checked(sensor: str, innovations: Innovations) -> Innovations:
     """Return innovations of another filter with their arrays checked."""
-    instance(f"innovations of {sensor}", given, Innovations, "give strapdown.records.Innovations")
-    time = array(f"{sensor}: time", given.time, ("m",))
+    instance(f"innovations of {sensor}", innovations, Innovations, "give strapdown.records.Innovations")
+    time = array(f"{sensor}: time", innovations.time, ("m",))
     return replace(
-        given,
+        innovations,
         time=time,
-        innovation=array(f"{sensor}: innovation", given.innovation, (len(time), "dof")),
-        variance=array(f"{sensor}: variance", given.variance, (len(time), "dof")),
-        weight=None if given.weight is None else array(f"{sensor}: weight", given.weight, (len(time),)),
+        innovation=array(f"{sensor}: innovation", innovations.innovation, (len(time), "dof")),
+        variance=array(f"{sensor}: variance", innovations.variance, (len(time), "dof")),
+        weight=None if innovations.weight is None else array(f"{sensor}: weight", innovations.weight, (len(time),)),
     )
 
 
@@ -267,7 +267,9 @@ class Estimate(ByValue, Listed):
             value = "" if k < 3 else self.bias[-1, k - 3] / size
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
         # The states of a direction or a heading are relative to its vector.
-        relative = tuple(f"{name} " for name, one in self.innovations.items() if one.innovation.shape[1] < 3)
+        relative = tuple(
+            f"{name} " for name, innovations in self.innovations.items() if innovations.innovation.shape[1] < 3
+        )
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
                 label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
@@ -276,15 +278,15 @@ class Estimate(ByValue, Listed):
                     word, size = "% of the vector", 0.01
                 rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
-        for sensor, one in self.innovations.items():
-            if np.any(one.used):
-                nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
-                gate = f", {one.refused} rejected by the gate" if one.refused else ""
+        for sensor, innovations in self.innovations.items():
+            if np.any(innovations.used):
+                nis = np.mean(innovations.nis[innovations.used]) / innovations.innovation.shape[1]
+                gate = f", {innovations.refused} rejected by the gate" if innovations.refused else ""
                 unused = (
                     f", {number} more missing or outside the record" if (number := self.skipped.get(sensor)) else ""
                 )
                 notes.append(
-                    f"{sensor}: {len(one.time)} measurements{gate}{unused}, mean NIS per degree of freedom {figure(nis, 3)}"
+                    f"{sensor}: {len(innovations.time)} measurements{gate}{unused}, mean NIS per degree of freedom {figure(nis, 3)}"
                 )
         return Table(
             f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
@@ -348,7 +350,7 @@ class Estimate(ByValue, Listed):
             bias=np.full((m, 3), np.nan) if bias is None else array("bias", bias, (m, 3), allow_nan=True),
             variance=np.diagonal(whole, axis1=1, axis2=2).copy(),
             covariance=whole,
-            innovations={name: _checked(name, one) for name, one in (innovations or {}).items()},
+            innovations={name: _checked(name, series) for name, series in (innovations or {}).items()},
         )
 
     @property
@@ -376,15 +378,16 @@ class Estimate(ByValue, Listed):
         ndarray (m, n)
             δθ, rad, body axes; δb, rad/s; error states in their units.
         """
-        given = dict(true_values or {})
-        if set(given) != set(self.error_states):
+        true_states = dict(true_values or {})
+        if set(true_states) != set(self.error_states):
             raise InputError(
-                f"true_values has {sorted(given)}, and the error states are {sorted(self.error_states)}; give each of them"
+                f"true_values has {sorted(true_states)}, and the error states are {sorted(self.error_states)}; give each of them"
             )
         turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
         parts = [turn, numbers("true_bias", true_bias, allow_nan=True) - self.bias]
         parts += [
-            numbers(f"true_values: {name}", given[name]) - states.values for name, states in self.error_states.items()
+            numbers(f"true_values: {name}", true_states[name]) - states.values
+            for name, states in self.error_states.items()
         ]
         return np.concatenate(parts, axis=-1)
 
@@ -470,38 +473,38 @@ class Estimate(ByValue, Listed):
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance
         q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
-        found: dict[str, NDArray[np.generic]] = {"time_s": self.time}
+        columns: dict[str, NDArray[np.generic]] = {"time_s": self.time}
         if recording is not None and recording.epoch_ns:
-            found = {"time_ns": np.rint(self.time * 1e9).astype(np.int64) + recording.epoch_ns}
-        found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
+            columns = {"time_ns": np.rint(self.time * 1e9).astype(np.int64) + recording.epoch_ns}
+        columns |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         assert angles.sigma is not None
         axes = sequence.upper()
         for k, axis in enumerate(axes):
             name = _NAMES[axis] if len(set(axes)) == 3 else f"angle_{k + 1}_{axis.lower()}"
-            found[f"{name}_deg"] = angles.angles[:, k] / DEGREE
-            found[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
+            columns[f"{name}_deg"] = angles.angles[:, k] / DEGREE
+            columns[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
         north = outputs.heading(self.attitude, P)
         assert north.sigma is not None
-        found |= {"heading_deg": north.angles / DEGREE, "heading_sigma_deg": north.sigma / DEGREE}
+        columns |= {"heading_deg": north.angles / DEGREE, "heading_sigma_deg": north.sigma / DEGREE}
         sigma = self.sigma
         for k, axis in enumerate("xyz"):
-            found[f"bias_{axis}_deg_per_h"] = self.bias[:, k] / DEGREE_PER_HOUR
-            found[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
+            columns[f"bias_{axis}_deg_per_h"] = self.bias[:, k] / DEGREE_PER_HOUR
+            columns[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
         if self.covariance is not None:
             size = 6 if np.isfinite(self.covariance[:, 3:, 3:]).any() else 3
             for i, j in itertools.combinations_with_replacement(range(size), 2):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
-                found[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = self.covariance[:, i, j]
+                columns[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = self.covariance[:, i, j]
         if recording is not None:
             rows = recording.rows_of(self.time)
             rate = recording.rate[rows] - self.bias
-            found |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
+            columns |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
             if recording.specific_force is not None:
                 free = outputs.free_acceleration(self.attitude, recording.specific_force[rows])
                 free = free if frame == "ENU" else free[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-                found |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
-        return found
+                columns |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
+        return columns
 
     def to_dataframe(self, **options: Any) -> Any:
         """Return the estimate as a pandas ``DataFrame`` with the columns of :meth:`table`.

@@ -174,7 +174,7 @@ class ImuRecord(Listed):
         """Return gyro and sensors with their numbers of samples, and the origin of the record, as a table."""
         span, count_ = self.time[-1] - self.time[0], len(self.increments)
         rows = [("gyro", "increments", count_, count_ / span)]
-        rows += [(one.sensor, one.kind, len(one.time), len(one.time) / span) for one in self.vectors]
+        rows += [(series.sensor, series.kind, len(series.time), len(series.time) / span) for series in self.vectors]
         notes = [f"Truth: {'attitude and gyro bias' if self.truth is not None else 'not known'}."]
         if self.origin is not None and self.origin.scenario is not None:
             name = self.origin.scenario.name or "a scenario"

@@ -30,7 +30,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     numbers = verdicts.summary(statistics, bound=bound)
     ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
-    parts = [page.paragraph(f"{one.title}:") + "\n" + page.table(one) for one in verdicts.tables(numbers)]
+    parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
     failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
@@ -78,10 +78,10 @@ def _estimated(statistics: Statistics) -> tuple[str, ...]:
 def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:
     """Return charts of ANEES and NIS with their bounds, and of the quantiles of the errors with those that the filter predicts."""
     charts = []
-    for one in judgement.findings:
-        if one.name == "ANEES" and one.of in ("attitude", "bias"):
-            lines = (page.Series(label="ANEES, all runs", value=statistics.anees[:, SUBSETS[one.of][0]]),)
-            charts.append(_bounded(f"ANEES of the {one.of}", statistics.time, lines, (one.low, one.high)))
+    for finding in judgement.findings:
+        if finding.name == "ANEES" and finding.of in ("attitude", "bias"):
+            lines = (page.Series(label="ANEES, all runs", value=statistics.anees[:, SUBSETS[finding.of][0]]),)
+            charts.append(_bounded(f"ANEES of the {finding.of}", statistics.time, lines, (finding.low, finding.high)))
     known = statistics.nis_degrees > 0
     if known.any():
         samples = round(float(np.median(statistics.nis_degrees[known]) * statistics.runs))
@@ -112,7 +112,7 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
 def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
     """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
     band = page.band(np.full(len(time), bounds[0]), np.full(len(time), bounds[1]))
-    log = bool(max(np.nanmax(one.value) for one in lines) > 4.0)
+    log = bool(max(np.nanmax(line.value) for line in lines) > 4.0)
     return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
 
 

@@ -26,7 +26,7 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     inside = (a.time >= b.time[0]) & (a.time <= b.time[-1])
     if not inside.any():
         spans = " and ".join(
-            f"{of} covers {one.time[0]:g} to {one.time[-1]:g} s" for of, one in ((first, a), (second, b))
+            f"{of} covers {estimate.time[0]:g} to {estimate.time[-1]:g} s" for of, estimate in ((first, a), (second, b))
         )
         raise InputError(f"{spans}; give estimates of the same time")
     time = a.time[inside]
@@ -100,7 +100,7 @@ def _differences(
         series = page.band(-first, first, (f"+3σ of {names[0]}", "−3σ"))
         series += page.band(-second, second, (f"+3σ of {names[1]}", "−3σ "), colour="--b", dash=True)
         series.append(page.Series(label="difference, second minus first", value=difference[:, k] / size))
-        reach = 1.3 * max(float(np.abs(one[settled]).max()) for one in (first, second, difference[:, k] / size))
+        reach = 1.3 * max(float(np.abs(curve[settled]).max()) for curve in (first, second, difference[:, k] / size))
         title, label = f"{what} {axis}, difference", f"{what.lower()} {axis}, {unit}"
         charts.append(page.chart(title, label, time, series, reach=reach))
     return charts

@@ -29,7 +29,7 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     drift_table, filter_table = coning_study.tables(study)
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
-    passing = [one["integration"] for one in filters if one["consistent"]]
+    passing = [row["integration"] for row in filters if row["consistent"]]
     answer = "consistent" if len(passing) == len(filters) else "not consistent"
     reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter: {', '.join(passing) or 'none'}"
     content = page.page(
@@ -50,14 +50,14 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 def _charts(names: list[str], rows: list[dict[str, Any]], charts: Any) -> list[str]:
     """Return a chart for each title and unit, of its series (label, key of the rows, colour) over the algorithms of these names."""
     places = np.linspace(0.0, len(names) - 1.0, len(names))
-    made = []
+    html = []
     for (title, unit), lines in charts.items():
         values = {
             key: np.array([np.nan if row[key] is None else float(row[key]) for row in rows]) for _, key, _ in lines
         }
         series = [page.Series(label=label, value=values[key], colour=colour) for label, key, colour in lines]
-        made.append(page.chart(title, unit, places, series, x="algorithm", ticks=names, log=True))
-    return made
+        html.append(page.chart(title, unit, places, series, x="algorithm", ticks=names, log=True))
+    return html
 
 
 _DRIFT = {

@@ -34,7 +34,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     judgement = workflows.check(estimate)
     table = None if truth is None else workflows.accuracy(estimate)
     span = estimate.time[-1] - estimate.time[0]
-    used = sum(len(one.time) for one in estimate.innovations.values())
+    used = sum(len(innovations.time) for innovations in estimate.innovations.values())
     source = "" if estimate.origin is None else estimate.origin.source
     content = page.page(
         f"Estimate of {source}" if source else f"Estimate {path.name}",
@@ -47,7 +47,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         *([] if table is None else [page.listed(table.listing())]),
         page.section("Evidence", page.table(judgement.listing())),
         _over_time(estimate, truth, error),
-        *[_sensor(name, one) for name, one in estimate.innovations.items()],
+        *[_sensor(name, innovations) for name, innovations in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
             "Provenance",

@@ -77,7 +77,7 @@ def section(title: str, *parts: str) -> str:
 
 def _contents(parts: Sequence[str]) -> str:
     """Return links to the sections among the parts of a page."""
-    heads = [found for part in parts for found in re.findall(r'<section id="([^"]*)"><h2>(.*?)</h2>', part)]
+    heads = [head for part in parts for head in re.findall(r'<section id="([^"]*)"><h2>(.*?)</h2>', part)]
     links = "".join(f'<li><a href="#{anchor}">{title}</a></li>' for anchor, title in heads)
     return f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n' if len(heads) > 1 else ""
 
@@ -149,10 +149,10 @@ def stored_figure(stem: Path, caption: str) -> str:
     for suffix, (kind, first) in _KINDS.items():
         path = stem.with_name(f"{stem.name}.{suffix}")
         if path.exists():
-            found = reading.content(path, link=False, maximum=LARGEST_FIGURE)
-            if not found.startswith(first):
+            content = reading.content(path, link=False, maximum=LARGEST_FIGURE)
+            if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
-            data = base64.b64encode(found).decode()
+            data = base64.b64encode(content).decode()
             image = f'<img src="data:{kind};base64,{data}" alt="{text(caption)}">'
             return section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
     return ""
@@ -175,15 +175,15 @@ def chart(
     ``unit`` and ``x`` are the labels of the axes. The vertical axis is ±``reach`` at first; None: the range of the data. ``ticks`` are the
     names of 0, 1, … on the horizontal axis, if it has no numbers; lines are then drawn as points.
     """
-    lines = [one.value for one in series if not one.band]
+    lines = [line.value for line in series if not line.band]
     rows = np.arange(len(time))
     if len(rows) > CHART_SAMPLES:  # a page of some ten megabytes
         columns = CHART_SAMPLES // (2 * len(lines))
         rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in lines]))
-    values = [one.value[rows] for one in series]
-    for k, one in enumerate(series):
-        if one.wraps:
-            values[k] = np.where(np.isin(rows, wraps(one.value, rows)), np.nan, values[k])
+    values = [line.value[rows] for line in series]
+    for k, line in enumerate(series):
+        if line.wraps:
+            values[k] = np.where(np.isin(rows, wraps(line.value, rows)), np.nan, values[k])
     content = {
         "title": title,
         "unit": unit,
@@ -264,8 +264,8 @@ def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
 
 def judged(judgement: Judgement) -> str:
     """Return the verdict box of a judgement."""
-    found = [finding.means for finding in judgement.findings if finding.rejected]
-    return verdict(judgement.verdict, judgement.reason, found)
+    reasons = [finding.means for finding in judgement.findings if finding.rejected]
+    return verdict(judgement.verdict, judgement.reason, reasons)
 
 
 def page(title: str, subtitle: str, *parts: str) -> str:

@@ -49,11 +49,13 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
         shown = content["report"]
         one_of("report.verdict", shown["verdict"], VERDICTS)
         texts = [content["units"], *content["records"], shown["reason"], *shown["details"], *shown["words"]]
-        tables = [Table(**one) for one in shown["tables"]]
-        texts += [text for one in tables for row in ([one.title], one.columns, one.notes, *one.rows) for text in row]
-        if not all(isinstance(text, str) for text in texts) or not all(isinstance(one.left, int) for one in tables):
+        tables = [Table(**table) for table in shown["tables"]]
+        texts += [
+            text for table in tables for row in ([table.title], table.columns, table.notes, *table.rows) for text in row
+        ]
+        if not all(isinstance(text, str) for text in texts) or not all(isinstance(table.left, int) for table in tables):
             raise TypeError("what is no text")
-        listed = [page.listed(one) for one in tables]
+        listed = [page.listed(table) for table in tables]
         charts = {}
         if "slices" in content:  # of the command
             charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
@@ -71,7 +73,7 @@ def _over_time(held: dict[str, Any]) -> list[str]:
     charts = []
     for before, after in zip(*(held[name].get("over_time", []) for name in ("before", "after")), strict=True):
         time, (low, high) = np.array(after["time_s"]), after["bounds"]
-        means = [np.array(one["mean"], float) for one in (before, after)]
+        means = [np.array(course["mean"], float) for course in (before, after)]
         bounds = (np.full(len(time), low), np.full(len(time), high))
         series = page.band(*bounds, ("99 % bounds, each interval", "lower bound"))
         series.append(page.Series(label="before", value=means[0], colour="--b", dash=True))
@@ -81,10 +83,10 @@ def _over_time(held: dict[str, Any]) -> list[str]:
     return charts
 
 
-def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
+def _slice(curve: dict[str, Any], parameter: dict[str, Any]) -> str:
     """Return a chart of the likelihood along a parameter, with its interval, its tuned and its previous value."""
     size, unit = parameter.get("si_per_unit", 1.0), parameter.get("unit", "")
-    values = np.array(one["values"]) / size
+    values = np.array(curve["values"]) / size
     first, last = float(values[0]), float(values[-1])
     value, before, low, high = (
         float(np.nan if parameter[key] is None else parameter[key] / size)
@@ -94,7 +96,7 @@ def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
     # A vertical line is two points of one value.
     marks = [x for x in (low, high, value, value, before, before) if first <= x <= last]
     x = np.sort(np.concatenate([np.geomspace(first, last, 400), marks]))
-    fallen = np.interp(np.log(x), np.log(values), np.array(one["fallen"], float))
+    fallen = np.interp(np.log(x), np.log(values), np.array(curve["fallen"], float))
     up = np.arange(len(x)) % 2 == 1
     line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
     within = (x >= low) & (x <= high)
@@ -106,5 +108,5 @@ def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
         page.Series(label="tuned", value=line(value), colour="--c"),
         page.Series(label="before", value=line(before), colour="--b", dash=True),
     ]
-    axis = f"{one['name']}, {unit}" if unit else one["name"]
-    return page.chart(one["name"], "−2 Δ log likelihood", x, series, x=axis, log_x=last > 20.0 * first)
+    axis = f"{curve['name']}, {unit}" if unit else curve["name"]
+    return page.chart(curve["name"], "−2 Δ log likelihood", x, series, x=axis, log_x=last > 20.0 * first)

@@ -103,11 +103,18 @@ def sections() -> list[Section]:
 def named(name: str) -> list[Section]:
     """Return the tables of a group, ``top``, ``motion``, ``gyro`` or ``sensors``, or those of one type, such as "coning", or header."""
     every = sections()
-    found = [one for one in every if name in (one.group, one.type, one.header, one.header.strip("[]"))]
-    if not found:
-        known = [*dict.fromkeys(one.group for one in every), *dict.fromkeys(one.type for one in every if one.type)]
+    sections_named = [
+        section
+        for section in every
+        if name in (section.group, section.type, section.header, section.header.strip("[]"))
+    ]
+    if not sections_named:
+        known = [
+            *dict.fromkeys(section.group for section in every),
+            *dict.fromkeys(section.type for section in every if section.type),
+        ]
         raise InputError(f"there is no section {name!r} in a scenario file; name one of {', '.join(known)}")
-    return found
+    return sections_named
 
 
 def listing(section: Section) -> Table:
@@ -147,15 +154,15 @@ def _motions() -> list[Section]:
         "time_s": {"type": "list of numbers", "example": [0.4 * k for k in range(6)]},
         "attitudes": {"type": "list of quaternions", "example": [[1.0, 0.0, 0.0, 0.0]] * 6},
     }
-    found = []
+    motions = []
     for word, (kind, form) in toml.MOTIONS.items():
         keys = tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
-        found.append(_section("motion", "[motion]", kind, keys, word))
+        motions.append(_section("motion", "[motion]", kind, keys, word))
     start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
     parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."
     harmonic, each = _keys(motion.Harmonic, toml.HARMONIC), " One such table for each."
     return [
-        *found,
+        *motions,
         _section("motion", "[[motion.harmonics]]", motion.Harmonic, harmonic, more=each),
         _section("motion", "[motion]", motion.rest, start, "rest"),
         _section("motion", "[motion]", motion.Composed, (), "composed", parts),
@@ -229,7 +236,7 @@ def _toml(value: Any) -> str:
         flat = np.asarray(value).ravel()
         if value and not np.any(flat):
             return "zeros"
-        return "[" + ", ".join(_toml(one) for one in value) + "]"
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
     if isinstance(value, float):
         return "none (`inf`)" if math.isinf(value) else f"{value:.9g}"
     return f"`{value!r}`".replace("'", '"') if isinstance(value, str) else str(value)

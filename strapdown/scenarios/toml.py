@@ -34,7 +34,9 @@ _OWN = ("harmonics", "faults", "orbit", "acceleration_f")
 
 def _form(kind: Any, units: Form) -> Form:
     """Return the keys of a class; a field that is not in ``units`` is a plain number or word."""
-    return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
+    return {
+        entry.name: units.get(entry.name, tables.PLAIN) for entry in dataclasses.fields(kind) if entry.name not in _OWN
+    }
 
 
 _OF_MOTIONS: Form = {
@@ -185,18 +187,18 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         values["temperature"] = tables.build(
             Temperature, tables.subtable(table["temperature"], where), TEMPERATURE, where
         )
-    made: Scenario = tables.construct(Scenario, values, table, TOP_FORM, place)
-    if made.duration * made.rate < 1.0:
+    scenario: Scenario = tables.construct(Scenario, values, table, TOP_FORM, place)
+    if scenario.duration * scenario.rate < 1.0:
         raise InputError(
-            f"{place}: {made.duration:g} s at {made.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
+            f"{place}: {scenario.duration:g} s at {scenario.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
         )
-    for sensor in made.sensors:
-        number = made.duration * getattr(sensor, "rate", 0.0)
+    for sensor in scenario.sensors:
+        number = scenario.duration * getattr(sensor, "rate", 0.0)
         if number > MAX_MEASUREMENTS:
             raise InputError(
                 f"{place}: {sensor.name} would measure {number:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or the duration"
             )
-    return made
+    return scenario
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -264,8 +266,8 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
     more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
     if orbit is not None:
         orbit_place = f"{place}: orbit"
-        found = tables.build(CircularOrbit, tables.subtable(orbit, orbit_place), ORBIT, orbit_place)
-        more.update({"orbit": found} if word == "horizon" else {"field_f": found.magnetic_field})
+        circular = tables.build(CircularOrbit, tables.subtable(orbit, orbit_place), ORBIT, orbit_place)
+        more.update({"orbit": circular} if word == "horizon" else {"field_f": circular.magnetic_field})
     elif word == "horizon":
         raise InputError(f"{place}: orbit is missing; add the table [sensors.orbit]")
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
@@ -313,7 +315,7 @@ def scenario_to_toml(scenario: Scenario) -> str:
     text = tomli_w.dumps(scenario_to_table(scenario))
     # A list of numbers on one line.
     return re.sub(
-        r"\[\n((?: +[^\[\]{}\"\n]+,\n)+) *\]", lambda found: f"[{' '.join(found[1].split()).rstrip(',')}]", text
+        r"\[\n((?: +[^\[\]{}\"\n]+,\n)+) *\]", lambda match: f"[{' '.join(match[1].split()).rstrip(',')}]", text
     )
 
 
@@ -364,9 +366,9 @@ def builtin() -> Table:
     """Return the built-in scenarios as a table."""
     contents = {name: reading.toml(BUILTIN / f"{name}.toml") for name in SCENARIOS}
     rows = [
-        (name, one["duration_s"], one["rate_hz"], one["gyro"].get("preset", "own figures"))
-        for name, one in contents.items()
+        (name, table["duration_s"], table["rate_hz"], table["gyro"].get("preset", "own figures"))
+        for name, table in contents.items()
     ]
     columns = ("name", Column("s", digits=6), Column("Hz", digits=6), "gyro")
-    notes = [f"{name}: {one['description']}" for name, one in contents.items()]
+    notes = [f"{name}: {table['description']}" for name, table in contents.items()]
     return Table("Built-in scenarios: `strapdown simulate NAME`", columns, rows, notes)

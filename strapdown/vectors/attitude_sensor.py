@@ -18,19 +18,19 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
     """Return a boresight as "x", "y" or "z" if it is along that axis, in either direction, otherwise as a unit vector."""
     if isinstance(value, str):
         return one_of(name, value.removeprefix("-"), ("x", "y", "z"))
-    given = np.asarray(numbers(name, value))
-    if given.shape == (4,):
-        (q,) = unit_quaternions(name, given[None])
+    components = np.asarray(numbers(name, value))
+    if components.shape == (4,):
+        (q,) = unit_quaternions(name, components[None])
         b = quaternion.rotate(q, np.array([0.0, 0.0, 1.0]))
-    elif given.shape == (3, 3):
-        if not np.allclose(given @ given.T, np.eye(3), atol=1e-6) or np.linalg.det(given) < 0.0:
+    elif components.shape == (3, 3):
+        if not np.allclose(components @ components.T, np.eye(3), atol=1e-6) or np.linalg.det(components) < 0.0:
             raise InputError(f"{name} is no rotation matrix: its rows must be orthogonal unit vectors, right-handed")
-        b = given[:, 2]
-    elif given.shape == (3,):
-        b = given
+        b = components[:, 2]
+    elif components.shape == (3,):
+        b = components
     else:
         raise InputError(
-            f"{name} has shape {given.shape}; give x, y or z, a direction (3,), or the mounting as a quaternion (4,) or matrix (3, 3)"
+            f"{name} has shape {components.shape}; give x, y or z, a direction (3,), or the mounting as a quaternion (4,) or matrix (3, 3)"
         )
     length = float(np.linalg.norm(b))
     if not np.isfinite(length) or length == 0.0:

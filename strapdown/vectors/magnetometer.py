@@ -54,8 +54,8 @@ class Magnetometer(Sampled, ByValue):
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
         if not callable(self.field_f):
             object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))
-            seen = self.field_f[:2] if self.kind == "heading" else self.field_f
-            if not np.any(seen):
+            effective = self.field_f[:2] if self.kind == "heading" else self.field_f
+            if not np.any(effective):
                 part = "horizontal part of field_f" if self.kind == "heading" else "field_f"
                 raise InputError(
                     f"{self.name}: {part} is zero, which has no direction; give the field at the location of the body"

@@ -79,13 +79,13 @@ class VectorMeasurements:
             if self.attitude is None:
                 raise InputError(f"{self.sensor}: a series of kind 'attitude' needs attitude (m, 4)")
             name = f"{self.sensor}: attitude"
-            given = array(name, self.attitude, (m, 4), allow_nan=True)
-            missing = _missing(given)
+            quaternions = array(name, self.attitude, (m, 4), allow_nan=True)
+            missing = _missing(quaternions)
             if missing.any():
-                whole = unit_quaternions(name, np.where(missing[:, None], quaternion.IDENTITY, given))
-                store["attitude"] = np.where(missing[:, None], given, whole)
+                whole = unit_quaternions(name, np.where(missing[:, None], quaternion.IDENTITY, quaternions))
+                store["attitude"] = np.where(missing[:, None], quaternions, whole)
             else:
-                store["attitude"] = unit_quaternions(name, given)
+                store["attitude"] = unit_quaternions(name, quaternions)
             store["vector_b"] = np.full((m, 3), np.nan)
         else:
             if self.attitude is not None:
@@ -146,33 +146,33 @@ class VectorMeasurements:
 
     def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
         """Return sigma (m,), and sigma_axes (m, 3) and covariance (m, 3, 3) if they are given."""
-        found: dict[str, Array] = {}
+        columns: dict[str, Array] = {}
         axes: Array | None = None
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
             raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
         if self.sigma_axes is not None:
-            given = self._repeated("sigma_axes", (m, 3), "one number per body axis (3,), or (m, 3)")
-            axes = _of_known(f"{self.sensor}: sigma_axes", given, missing, _root_mean_square)
+            own = self._repeated("sigma_axes", (m, 3), "one number per body axis (3,), or (m, 3)")
+            axes = _of_known(f"{self.sensor}: sigma_axes", own, missing, _root_mean_square)
             if np.any(axes < 0.0):
                 raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
-            found["sigma_axes"] = axes
+            columns["sigma_axes"] = axes
         known: Any = ~missing if missing.any() else slice(None)
         if self.covariance is not None:
-            found["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m, missing)
+            columns["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m, missing)
             diagonal = np.sqrt(np.einsum("kii->ki", whole))
             if axes is not None and not np.allclose(axes[known], diagonal[known], rtol=1e-12, atol=0.0):
                 raise InputError(f"{self.sensor}: sigma_axes and covariance contradict each other; give one of them")
             axes = diagonal
             if self.kind == "attitude":
-                found["sigma_axes"] = axes
+                columns["sigma_axes"] = axes
         by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
-        given = self._repeated("sigma", (m,), f"one number, or one per sample{by_axis}")
+        own = self._repeated("sigma", (m,), f"one number, or one per sample{by_axis}")
         given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
         if axes is None and self.kind == "attitude" and not given_sigma:
             raise InputError(
                 f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
             )
-        sigma = _of_known(f"{self.sensor}: sigma", given, missing, _root_mean_square)
+        sigma = _of_known(f"{self.sensor}: sigma", own, missing, _root_mean_square)
         if np.any(sigma < 0.0):
             k = int(np.argmax(sigma < 0.0))
             raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
@@ -192,17 +192,17 @@ class VectorMeasurements:
                 )
             sigma = mean
         elif self.kind == "attitude":
-            found["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
-        found["sigma"] = sigma
-        return found
+            columns["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
+        columns["sigma"] = sigma
+        return columns
 
     def _repeated(self, field: str, shape: tuple[int, ...], remedy: str) -> Array:
         """Return the numbers of a field for each sample, of this shape; those for one sample are repeated."""
         name = f"{self.sensor}: {field}"
-        given = numbers(name, getattr(self, field), allow_nan=True)
-        if given.shape not in ((), shape[1:], (1, *shape[1:]), shape):
-            raise InputError(f"{name} has shape {given.shape} for {shape[0]} samples; give {remedy}")
-        return array(name, np.broadcast_to(given, shape), shape, allow_nan=True)
+        own = numbers(name, getattr(self, field), allow_nan=True)
+        if own.shape not in ((), shape[1:], (1, *shape[1:]), shape):
+            raise InputError(f"{name} has shape {own.shape} for {shape[0]} samples; give {remedy}")
+        return array(name, np.broadcast_to(own, shape), shape, allow_nan=True)
 
     def _reference(self, m: int, missing: np.ndarray) -> Array:
         name = f"{self.sensor}: reference_f"
@@ -318,17 +318,17 @@ def _first_or_level(known: Array) -> Array:
 
 def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Array:
     """Return covariances (m, 3, 3), checked to be symmetric without negative eigenvalues; a single one is repeated."""
-    given = numbers(name, value)
-    if given.shape == (3, 3):
-        one = array(name, given, (3, 3))[None]
-        whole = np.broadcast_to(one, (m, 3, 3))
+    own = numbers(name, value)
+    if own.shape == (3, 3):
+        sample = array(name, own, (3, 3))[None]
+        whole = np.broadcast_to(sample, (m, 3, 3))
     else:
-        one = whole = _of_known(name, array(name, given, (m, 3, 3), allow_nan=True), missing, _mean_covariance)
-    size = np.einsum("kii->k", np.abs(one))[:, None, None]
-    lopsided = np.any(np.abs(one - np.swapaxes(one, 1, 2)) > 1e-12 * size, axis=(1, 2))
+        sample = whole = _of_known(name, array(name, own, (m, 3, 3), allow_nan=True), missing, _mean_covariance)
+    size = np.einsum("kii->k", np.abs(sample))[:, None, None]
+    lopsided = np.any(np.abs(sample - np.swapaxes(sample, 1, 2)) > 1e-12 * size, axis=(1, 2))
     if lopsided.any():
         raise InputError(f"{name}[{int(np.argmax(lopsided))}] is not symmetric; use ½(C + Cᵀ)")
-    least = np.linalg.eigvalsh(one)[:, 0] if len(one) else np.zeros(0)
+    least = np.linalg.eigvalsh(sample)[:, 0] if len(sample) else np.zeros(0)
     if np.any(least < -1e-12 * size.ravel()):
         k = int(np.argmin(least))
         raise InputError(
@@ -375,13 +375,13 @@ def direction(name: str, value: ArrayLike) -> Array:
 
 def triad(reference_f: ArrayLike) -> Array:
     """Return unit vectors (u, v, r) as rows (..., 3, 3), right-handed (u × v = r), r along ``reference_f`` (..., 3)."""
-    given = array("reference_f", reference_f, (..., 3))
-    if given.ndim == 1:
-        return _one_triad(*given.tolist())
-    length = np.linalg.norm(given, axis=-1, keepdims=True)
+    reference = array("reference_f", reference_f, (..., 3))
+    if reference.ndim == 1:
+        return _one_triad(*reference.tolist())
+    length = np.linalg.norm(reference, axis=-1, keepdims=True)
     if np.any(length == 0.0):
         raise InputError("reference_f is the zero vector, which has no direction")
-    r = given / length
+    r = reference / length
     u = np.cross(np.eye(3)[np.argmin(np.abs(r), axis=-1)], r)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     return np.stack([u, np.cross(r, u), r], axis=-2)

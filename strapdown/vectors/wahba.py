@@ -288,9 +288,9 @@ def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
     bad = least < 1.0 / LARGEST_UNCERTAINTY
     if np.any(bad):
         index = tuple(np.argwhere(bad)[0]) if np.ndim(bad) else ()
-        one = vectors[index]
-        i, j = np.triu_indices(one.shape[-2], 1)
-        angle = _angle(one[i], one[j])
+        directions = vectors[index]
+        i, j = np.triu_indices(directions.shape[-2], 1)
+        angle = _angle(directions[i], directions[j])
         widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
         uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
         raise InputError(
