@@ -587,6 +587,35 @@ def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
     assert ask("own") == [(10.0, 0)]
 
 
+ASK_ADDRESSES = """
+import ctypes, importlib
+from strapdown.kernels import machine, open_probe
+fast = [machine.compiled(open_probe.run, importlib.import_module(name)) for name in arguments]
+hits = [(f(1.0), sum(f.stats.cache_hits.values())) for f in fast]
+double, pointer = ctypes.c_double, ctypes.c_void_p
+call = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.POINTER(double), ctypes.POINTER(pointer), double)  # numba's convention
+answer = []
+for f in fast:
+    result = double()
+    call(machine.address_of(f, (1.0,)))(ctypes.byref(result), ctypes.byref(pointer()), 1.0)
+    answer.append(result.value)
+answer = answer, hits
+"""
+
+
+def test_addresses_are_those_of_each_body_whichever_process_compiled_it(copied_kernels):
+    """numba numbers functions from the start of each process: without the body in their names, two symbols would be one."""
+    kernels, root = copied_kernels, copied_kernels.parent.parent
+    (kernels / "open_probe.py").write_text(OPEN_PROBE)
+    for number in (3, 7):
+        (kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
+    three, seven = (f"strapdown.kernels.term_{number}" for number in (3, 7))
+    ask = partial(in_a_new_process, root, ASK_ADDRESSES)
+    assert ask(three) == ([6.0], [(6.0, 0)])
+    assert ask(seven) == ([14.0], [(14.0, 0)])
+    assert ask(three, seven) == ([6.0, 14.0], [(6.0, 1), (14.0, 1)])
+
+
 ASK_DIGESTS = """
 from pathlib import Path
 from strapdown.kernels import machine

@@ -128,7 +128,10 @@ def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType
     others = (name for name in _names(function.__code__) if name in function.__globals__ and name not in bound)
     bound |= {"__name__": function.__module__, **{name: function.__globals__[name] for name in others}}
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
-    twin.__qualname__ = function.__qualname__
+    # numba names symbols by the qualified name and a number that begins anew in each process: two bodies of a function, from the caches of
+    # two processes, would have one name, and an address would be that of either.
+    digest = hashlib.sha256(" ".join(module.__name__ for module in parts).encode()).hexdigest()
+    twin.__qualname__ = f"{function.__qualname__}_{digest[:16]}" if parts else function.__qualname__
     twin.__doc__ = function.__doc__
     return twin
 
