@@ -716,11 +716,11 @@ def turning_matrix(rate, acceleration):
 
 def across(d, like):
     """Return unit vectors t1, t2 with t1 × t2 = d, for a unit vector d."""
-    one = like + 1.0
+    ones = like + 1.0
     x, y, z = select(d[0] < 0.0, -d[0], d[0]), select(d[1] < 0.0, -d[1], d[1]), select(d[2] < 0.0, -d[2], d[2])
-    second = select(y < x, select(y <= z, one, like), like)
-    third = select(z < x, one - second, like)
-    t = cross((one - second - third, second, third), d)
+    second = select(y < x, select(y <= z, ones, like), like)
+    third = select(z < x, ones - second, like)
+    t = cross((ones - second - third, second, third), d)
     t = scale(1.0 / square_root(dot(t, t)), t)
     return t, cross(d, t)
 
@@ -798,15 +798,15 @@ def rows_of(s, x, measured, numbers, like, transverse=False):
 def attitude_rows(s, x, measured, numbers, like):
     """Return the rows of an attitude: the offset is a rotation vector between sensor axes and body axes."""
     sensor, q = STRUCTURE.sensors[s], tuple_at(x, 0, 4, like)
-    one = like + 1.0
+    ones = like + 1.0
     identity = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     if not sensor.states:
         y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured.frame[:4]))
-        axes = ((one, like, like), (like, one, like), (like, like, one))
-        return tuple(e + (0,) * (N - 3) for e in identity), y, axes, like < one
+        axes = ((ones, like, like), (like, ones, like), (like, like, ones))
+        return tuple(e + (0,) * (N - 3) for e in identity), y, axes, like < ones
     effects = effects_of(sensor, x, measured, numbers, like)
     offset = tuple(like if is_zero(t) else t for t in effects.offset)
-    turned_and_J = turned_by((one, like, like, like), offset)
+    turned_and_J = turned_by((ones, like, like, like), offset)
     turn, J = turned_and_J[:4], turned_and_J[4:]
     predicted = quaternion_multiply(q, turn)
     y = rotation_vector(
@@ -815,7 +815,7 @@ def attitude_rows(s, x, measured, numbers, like):
     E = transpose(rotation_matrix(turn))  # exp(−[φ]): transforms a body-side error by the further rotation φ
     entering = {t.state: matrix_products(J, a) for t, a in zip(sensor.states, effects.offsets, strict=True)}
     rows = tuple(E[3 * i : 3 * i + 3] + tuple(entering[k][i] if k in entering else 0 for k in OTHERS) for i in AXES)
-    axes = ((one, like, like), (like, one, like), (like, like, one))
+    axes = ((ones, like, like), (like, ones, like), (like, like, ones))
     return rows, y, axes, dot(offset, offset) < SQUARED_RANGE * 1e9
 
 
@@ -823,19 +823,19 @@ def heading_rows(s, x, measured, numbers, like):
     """Return the row of a heading, its residual, and whether the vector has one."""
     sensor, r = STRUCTURE.sensors[s], measured.frame[6:]
     R = rotation_matrix(tuple_at(x, 0, 4, like))
-    one = like + 1.0
-    axes = ((one, like, like),)
+    ones = like + 1.0
+    axes = ((ones, like, like),)
     if not sensor.states:
         m = matrix_times_vector(R, measured.z)
         level = m[0] * m[0] + m[1] * m[1]
         valid = level > VERTICAL
-        tilt = -m[2] / select(valid, level, one)
-        unit_row = select(valid, one, like)
+        tilt = -m[2] / select(valid, level, ones)
+        unit_row = select(valid, ones, like)
         h = transpose_times_vector(R, (unit_row * (tilt * m[0]), unit_row * (tilt * m[1]), unit_row))
         y = unit_row * arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
         return (h + (0,) * (N - 3),), (y,), axes, valid
     effects = effects_of(sensor, x, measured, numbers, like)
-    M = tuple(plus(one if i in DIAGONAL else 0, m) for i, m in enumerate(effects.M))
+    M = tuple(plus(ones if i in DIAGONAL else 0, m) for i, m in enumerate(effects.M))
     D = inverse(tuple(like if is_zero(m) else m for m in M)) if any_number(effects.M) else None
     clean = subtract(measured.z, tuple(like if is_zero(t) else t for t in effects.offset))
     if D is not None:
@@ -846,14 +846,14 @@ def heading_rows(s, x, measured, numbers, like):
     m = subtract(p, fixed)
     level = m[0] * m[0] + m[1] * m[1]
     valid = level > VERTICAL
-    unit_row = select(valid, one, like)
+    unit_row = select(valid, ones, like)
     y = unit_row * arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
     # Derivatives at the predicted heading: those at the measured one depend on its noise, which would bias the estimated offsets.
     stretch = square_root(level / (r[0] * r[0] + r[1] * r[1]))
     m = (stretch * r[0], stretch * r[1], m[2])
     p = add(m, fixed)
     clean = transpose_times_vector(R, add(p, carried))
-    inverted = unit_row / select(valid, m[0] * m[0] + m[1] * m[1], one)
+    inverted = unit_row / select(valid, m[0] * m[0] + m[1] * m[1], ones)
     g = (-inverted * m[1], inverted * m[0], like)
     h = dict(enumerate(transpose_times_vector(R, cross(p, g))))
     share = 1.0 / measured.length

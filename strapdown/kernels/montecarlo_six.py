@@ -50,8 +50,8 @@ def corrected(state, value, e, measured, body, like):
     q, b, A, B, C, lost = state
     at, sensor = measured.place[e], measured.sensor[e]
     kind, variance = measured.series[sensor, KIND], measured.noise[at, 0]
-    z, one = (value[0], value[1], value[2]), like + 1.0
-    e2, s2, e3, s3 = like, one, like, one
+    z, ones = (value[0], value[1], value[2]), like + 1.0
+    e2, s2, e3, s3 = like, ones, like, ones
     if kind == ATTITUDE:
         y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), value))
         variances = (variance, measured.noise[at, 3], measured.noise[at, 5])
@@ -72,7 +72,7 @@ def corrected(state, value, e, measured, body, like):
             )
             if kind == VECTOR:
                 e3 = dot(transpose_times_vector(R, r), z) - 1.0
-                s3 = variance * one
+                s3 = variance * ones
                 nis = nis + e3 * e3 / variance
     lost = lost or any_lane(s1 > MAX_PRECISION * variance)
     return State(q, b, A, B, C, lost), nis, (e1, s1, e2, s2, e3, s3)

@@ -205,12 +205,12 @@ def prepare_rows(work, group):
     blocks = MATRICES // WIDTH if any_lane(load(work, group + MOVED) > 0.5) else TURN // WIDTH
     for k in range(blocks):
         for i in range(0, WIDTH, 4):
-            one, two, three, four = load_quadruples(work, COLUMNS + WIDTH * WIDTH * k + i, WIDTH)
+            first, second, third, fourth = load_quadruples(work, COLUMNS + WIDTH * WIDTH * k + i, WIDTH)
             s = group + MATRICES * i + WIDTH * k
-            store(work, s, one)
-            store(work, s + MATRICES, two)
-            store(work, s + 2 * MATRICES, three)
-            store(work, s + 3 * MATRICES, four)
+            store(work, s, first)
+            store(work, s + MATRICES, second)
+            store(work, s + 2 * MATRICES, third)
+            store(work, s + 3 * MATRICES, fourth)
 
 
 def times_columns(work, places, columns):
