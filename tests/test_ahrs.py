@@ -874,15 +874,23 @@ def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smoo
     np.testing.assert_array_equal(without.variance, estimate.variance)
 
 
-def test_the_share_of_the_tilt_scales_the_tilt_alone():
-    """The filter's covariance in fixed axes, its first two rows and columns by one factor."""
+def by_share(variance, share, limit):
+    """A share of a variance up to a limit, and all that exceeds it; a share above 1 is of the whole."""
+    return np.where(
+        share < 1.0, share * np.minimum(variance, limit) + np.maximum(variance - limit, 0.0), share * variance
+    )
+
+
+@pytest.mark.parametrize("heading_share", [1.0, 0.05, 2.0])
+def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share):
+    """The filter's covariance in fixed axes, its first two rows and columns by one factor, the third by another."""
     unit = dataclasses.replace(
         ahrs.HAND_HELD,
         iron_sigma=0.0,
         rest_bias_sigma=0.0,
         tilt_sigma=0.0,
         tilt_by_field=0.0,
-        heading_share=1.0,
+        heading_share=heading_share,
         heading_by_field=0.0,
     )
     found = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
@@ -894,16 +902,22 @@ def test_the_share_of_the_tilt_scales_the_tilt_alone():
     P = found.estimate.covariance[rows, :3, :3] - found.delays.sigma**2 * rate[:, :, None] * rate[:, None, :]
     R, own_R = quaternion.to_matrix(found.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
     scaled = R @ P @ R.transpose(0, 2, 1)
-    ratio = scaled / (own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1))
-    tilt = np.sqrt(ratio[:, 0, 0])
-    np.testing.assert_allclose(tilt, np.sqrt(unit.tilt_share), rtol=1e-6)
+    filtered = own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1)
+    ratio = scaled / filtered
+    level, vertical = np.maximum(filtered[:, 0, 0], filtered[:, 1, 1]), filtered[:, 2, 2]
+    limit = (3.0 * DEGREE) ** 2 * np.array([1.0, 1.0 / 0.07])
+    tilt = np.sqrt(by_share(level, unit.tilt_share, limit[0]) / level)
+    heading = np.sqrt(by_share(vertical, heading_share, limit[1]) / vertical)
+    assert level[0] > limit[0]  # an uncertain start, and then one that the first measurements have made certain
+    assert tilt[-1] == pytest.approx(np.sqrt(unit.tilt_share), rel=1e-9)
+    np.testing.assert_allclose(ratio[:, 0, 0], tilt**2, rtol=1e-6)
     np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
-    np.testing.assert_allclose(ratio[:, 2, 2], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(ratio[:, 2, 2], heading**2, rtol=1e-6)
     correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
     assert correlated.mean() > 0.5
-    np.testing.assert_allclose(ratio[correlated, 0, 2], tilt[correlated], rtol=1e-6)
+    np.testing.assert_allclose(ratio[correlated, 0, 2], (tilt * heading)[correlated], rtol=1e-6)
     beside, with_bias = found.estimate.covariance[rows], own_R @ plain.covariance[:, :3, 3:]
-    with_bias[:, :2] *= tilt[:, None, None]
+    with_bias *= np.stack([tilt, tilt, heading], axis=1)[:, :, None]
     np.testing.assert_allclose(R @ beside[:, :3, 3:], with_bias, atol=1e-6 * np.abs(with_bias).max())
     np.testing.assert_array_equal(beside[:, 3:, :3], beside[:, :3, 3:].transpose(0, 2, 1))
     np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])

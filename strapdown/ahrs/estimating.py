@@ -286,7 +286,7 @@ def _at_stamps(
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),
         recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),
-        delays.sigma**2,
+        regions.limits(parameters, delays.sigma),
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))

@@ -150,7 +150,7 @@ class LiveAhrs:
         carried = (
             k.Steps(steps.edge, *map(read_only, steps[1:])),
             k.Stamps(*map(read_only, stamps)),
-            sigma**2,
+            regions.limits(parameters, sigma),
             self._found,
         )
         return kernel.Imu(

@@ -13,6 +13,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
+from strapdown.ahrs.starting import MIN_LEVEL
 from strapdown.checks import Array
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -93,6 +94,15 @@ def shares_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_st
         field_level=FIELD_LEVEL,
         gravity=STANDARD_GRAVITY,
     )
+
+
+def limits(parameters: AhrsParameters, delay_sigma: float) -> recording_steps.Limits:
+    """Return the constants of the covariance at the stamps, whose delay has that σ, s.
+
+    σ of a tilt known from the specific force at rest is the limit for the tilt, and that of the heading in the steepest field for it.
+    """
+    tilt = parameters.attitude_sigma**2
+    return recording_steps.Limits(timing=delay_sigma**2, tilt=tilt, heading=tilt / MIN_LEVEL)
 
 
 def disagreement(smoothed: Array, filtered: Array) -> float:

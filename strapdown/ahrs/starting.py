@@ -33,6 +33,8 @@ VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
 """Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
+MIN_LEVEL = 0.07
+"""Squared cosine of the dip, 75°, beyond which a field has hardly a heading."""
 FIRST_HEADING = 0.1
 """σ of the first sample of the field, relative to its magnitude, which a disturbance has that later ones show."""
 
@@ -133,7 +135,7 @@ def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> es
     if recording.magnetic_field is not None:
         up = force / np.linalg.norm(force)
         sine = float(up @ across) / float(np.linalg.norm(across))
-        level = max(1.0 - sine**2, 0.07)  # a field steeper than 75° has hardly a heading
+        level = max(1.0 - sine**2, MIN_LEVEL)
         P[:3, :3] += np.outer(up, up) * ((sine * tilt) ** 2 + FIRST_HEADING**2) / level
     return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
 

@@ -196,7 +196,7 @@ def begin(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, vector
     tilt = m.select(tilt < starting.MAX_TILT_SIGMA, tilt, starting.MAX_TILT_SIGMA)
     heading = 0.0
     if r.magnetometer:
-        steep = m.select(level > 0.07, level, 0.07)
+        steep = m.select(level > starting.MIN_LEVEL, level, starting.MIN_LEVEL)
         heading = (sine * sine * (tilt * tilt) + starting.FIRST_HEADING**2) / steep
     for i in range(4):
         f.x[i] = q[i]

@@ -185,11 +185,28 @@ def block_at(P, first):
     return tuple(P[i, first + j] for i in range(3) for j in range(3))
 
 
-def carry_to_stamps(steps, stamps, timing, out):
-    """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay.
+class Limits(NamedTuple):
+    """Constants of the covariance at the stamps."""
 
-    The covariance includes a timing error of variance ``timing``, s², along the rate.
+    timing: float
+    """Variance of the timing error, along the rate, s²."""
+    tilt: float
+    heading: float
+    """Variances, rad², up to which a factor below 1 applies."""
+
+
+def limited(factor, variance, limit):
+    """Return the factor on σ if one below 1 applies to the variance up to a limit only, and not to what exceeds it.
+
+    Such a factor stands for motion and fields that are usually smaller than modelled. They cause at most the variance of a filter that has
+    settled; a larger one, as at a start in motion or after a gap, is of a rotation that is unknown.
     """
+    less = min(factor, 1.0)
+    return max(factor, 1.0) * math.sqrt(1.0 - (1.0 - less * less) * min(limit / variance, 1.0))
+
+
+def carry_to_stamps(steps, stamps, limits, out):
+    """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay."""
     for k in range(len(steps.edge)):
         first = steps.edge[k]
         last = steps.edge[k + 1] if k + 1 < len(steps.edge) else len(stamps.time)
@@ -200,7 +217,9 @@ def carry_to_stamps(steps, stamps, timing, out):
         P = steps.covariance[k]
         R = rotation_matrix(begin)
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
-        s, h, floor, iron = steps.tilt[k], steps.heading[k], steps.floor[k], steps.iron[k]
+        s = limited(steps.tilt[k], max(xx, yy), limits.tilt)
+        h = limited(steps.heading[k], zz, limits.heading)
+        floor, iron = steps.floor[k], steps.iron[k]
         fixed = full((s * s * xx + floor, s * s * xy, s * h * xz, s * s * yy + floor, s * h * yz, h * h * zz))
         across = multiply(R, block_at(P, 3))
         across = scale(s, across[:3]) + scale(s, across[3:6]) + scale(h, across[6:])
@@ -212,7 +231,7 @@ def carry_to_stamps(steps, stamps, timing, out):
             R = rotation_matrix(q)
             own = times_transpose_upper(multiply(transpose(R), fixed), transpose(R))
             w = vector_at(stamps.rate, n)
-            own = symmetric_minus_outer(own, scale(-timing, w), w)
+            own = symmetric_minus_outer(own, scale(-limits.timing, w), w)
             up = (R[6], R[7], R[8])  # in body axes
             own = full(symmetric_minus_outer(own, scale(-iron, up), up))
             store_row(out.attitude, n, q)
