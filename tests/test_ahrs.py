@@ -932,6 +932,21 @@ def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     assert score.errors[0] < 15.0 * DEGREE
 
 
+def test_the_tilt_of_starts_in_motion_is_as_uncertain_as_it_is_wrong():
+    """Of twelve units in the hand over their first second: the filter's own σ, not the share that acceleration has of it later."""
+    squares, variances = [], []
+    for seed in range(1, 13):
+        moving = hand_held.modified(hand_held.simulated(seed, 0, 14.0))["no rest"]
+        estimate = ahrs.estimate(moving, full_covariance=True).estimate
+        first = moving.time < moving.time[0] + 1.0
+        R = quaternion.to_matrix(estimate.attitude[first])
+        error = reference_errors(estimate.attitude[first], moving.true_attitude[first]).inclination
+        P = R @ estimate.covariance[first, :3, :3] @ R.transpose(0, 2, 1)
+        squares.append(np.mean(error**2))
+        variances.append(np.mean(P[:, 0, 0] + P[:, 1, 1]))
+    assert 0.6 < np.sqrt(np.mean(squares) / np.mean(variances)) < 1.4
+
+
 # ---------------------------------------------------------------------------------------------------- BROAD
 
 

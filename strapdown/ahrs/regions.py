@@ -1,8 +1,8 @@
 """The reported covariance: the filter's own, scaled by what the recording shows so far of the field.
 
 One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. Its
-innovations show how far a recording differs from it. The scales were chosen so that the 95 %
-regions hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend on them.
+innovations show how far a recording differs from it. The scales were chosen so that the 95 % regions hold on the development halves of
+eight sets (``benchmarks/recordings.py``); the estimate does not depend on them. Scales below 1 apply to the variance of a settled filter.
 """
 
 from __future__ import annotations
