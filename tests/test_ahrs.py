@@ -883,7 +883,7 @@ def by_share(variance, share, limit):
 
 @pytest.mark.parametrize("heading_share", [1.0, 0.05, 2.0])
 def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share):
-    """The filter's covariance in fixed axes, its first two rows and columns by one factor, the third by another."""
+    """The filter's covariance in fixed axes, along the principal axes of the tilt and about the vertical."""
     unit = dataclasses.replace(
         ahrs.HAND_HELD,
         iron_sigma=0.0,
@@ -903,21 +903,22 @@ def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share):
     R, own_R = quaternion.to_matrix(found.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
     scaled = R @ P @ R.transpose(0, 2, 1)
     filtered = own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1)
-    ratio = scaled / filtered
-    level, vertical = np.maximum(filtered[:, 0, 0], filtered[:, 1, 1]), filtered[:, 2, 2]
     limit = (3.0 * DEGREE) ** 2 * np.array([1.0, 1.0 / 0.07])
-    tilt = np.sqrt(by_share(level, unit.tilt_share, limit[0]) / level)
-    heading = np.sqrt(by_share(vertical, heading_share, limit[1]) / vertical)
-    assert level[0] > limit[0]  # an uncertain start, and then one that the first measurements have made certain
-    assert tilt[-1] == pytest.approx(np.sqrt(unit.tilt_share), rel=1e-9)
-    np.testing.assert_allclose(ratio[:, 0, 0], tilt**2, rtol=1e-6)
-    np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
-    np.testing.assert_allclose(ratio[:, 2, 2], heading**2, rtol=1e-6)
-    correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
-    assert correlated.mean() > 0.5
-    np.testing.assert_allclose(ratio[correlated, 0, 2], (tilt * heading)[correlated], rtol=1e-6)
-    beside, with_bias = found.estimate.covariance[rows], own_R @ plain.covariance[:, :3, 3:]
-    with_bias *= np.stack([tilt, tilt, heading], axis=1)[:, :, None]
+    variance, axes = np.linalg.eigh(filtered[:, :2, :2])
+    factor = np.sqrt(by_share(variance, unit.tilt_share, limit[0]) / variance)
+    vertical = filtered[:, 2, 2]
+    S = np.zeros_like(filtered)
+    S[:, :2, :2] = (axes * factor[:, None]) @ axes.transpose(0, 2, 1)
+    S[:, 2, 2] = np.sqrt(by_share(vertical, heading_share, limit[1]) / vertical)
+    assert (
+        variance[0].max() > limit[0]
+    )  # an uncertain start, and then one that the first measurements have made certain
+    np.testing.assert_allclose(factor[-1], np.sqrt(unit.tilt_share), rtol=1e-9)
+    size = np.sqrt(np.einsum("kii->ki", filtered))
+    np.testing.assert_allclose(
+        scaled / size[:, :, None] / size[:, None], S @ filtered @ S / size[:, :, None] / size[:, None], atol=1e-6
+    )
+    beside, with_bias = found.estimate.covariance[rows], S @ own_R @ plain.covariance[:, :3, 3:]
     np.testing.assert_allclose(R @ beside[:, :3, 3:], with_bias, atol=1e-6 * np.abs(with_bias).max())
     np.testing.assert_array_equal(beside[:, 3:, :3], beside[:, :3, 3:].transpose(0, 2, 1))
     np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])

@@ -205,6 +205,15 @@ def limited(factor, variance, limit):
     return max(factor, 1.0) * math.sqrt(1.0 - (1.0 - less * less) * min(limit / variance, 1.0))
 
 
+def level_factors(factor, xx, xy, yy, limit):
+    """Return the symmetric matrix (xx, xy, yy) by which the tilt is scaled: :func:`limited` along the principal axes of its covariance."""
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    apart = math.sqrt(half * half + xy * xy)
+    most, least = limited(factor, mean + apart, limit), limited(factor, max(mean - apart, 1e-30), limit)
+    middle, slope = 0.5 * (most + least), 0.5 * (most - least) / max(apart, 1e-300)
+    return middle + slope * half, slope * xy, middle - slope * half
+
+
 def carry_to_stamps(steps, stamps, limits, out):
     """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay."""
     for k in range(len(steps.edge)):
@@ -217,12 +226,16 @@ def carry_to_stamps(steps, stamps, limits, out):
         P = steps.covariance[k]
         R = rotation_matrix(begin)
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
-        s = limited(steps.tilt[k], max(xx, yy), limits.tilt)
+        sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt)
         h = limited(steps.heading[k], zz, limits.heading)
         floor, iron = steps.floor[k], steps.iron[k]
-        fixed = full((s * s * xx + floor, s * s * xy, s * h * xz, s * s * yy + floor, s * h * yz, h * h * zz))
+        x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
+        level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
+        beside = (h * (sx * xz + sm * yz), h * (sm * xz + sy * yz))
+        fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz))
         across = multiply(R, block_at(P, 3))
-        across = scale(s, across[:3]) + scale(s, across[3:6]) + scale(h, across[6:])
+        first_row, second_row = across[:3], across[3:6]
+        across = combine(sx, first_row, sm, second_row) + combine(sm, first_row, sy, second_row) + scale(h, across[6:])
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late[n]
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
