@@ -650,6 +650,16 @@ def test_a_digest_depends_on_the_sources_used_and_on_no_others(copied_kernels):
         before = after
 
 
+def test_a_digest_depends_on_a_file_outside_that_is_named_as_one_inside(tmp_path):
+    own = tmp_path / "walk.py"
+    files = str(PACKAGE / "kernels" / "walk.py"), str(own)
+    own.write_text("a = 1\n")
+    before = machine.sources_digest(*files)
+    own.write_text("a = 2\n")
+    machine.sources_digest.cache_clear()
+    assert machine.sources_digest(*files) != before
+
+
 EDITED = """
 from pathlib import Path
 from strapdown.kernels import machine

@@ -34,17 +34,16 @@ class CacheWarning(UserWarning):
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """The entries of one kernel. ``sources`` is a digest of all that it is compiled from, ``parts`` the modules of its open functions."""
+    """The entries of one kernel, whose ``name`` includes the bodies it is bound to; ``sources``: digest of all that it is compiled from."""
 
     _warned = False
 
-    def __init__(self, function: Any, sources: str, parts: tuple[str, ...]) -> None:
+    def __init__(self, function: Any, name: str, sources: str) -> None:
         super().__init__(function)
-        name = "".join(c if c.isalnum() or c in "._" else "_" for c in f"{function.__module__}.{function.__qualname__}")
-        of_parts = hashlib.sha256(repr(parts).encode()).hexdigest()
-        self._prefix = f"{name}.{sys.implementation.cache_tag}-{of_parts[:8]}"
+        file_name = "".join(c if c.isalnum() or c in "._" else "_" for c in f"{function.__module__}.{name}")
+        self._prefix = f"{file_name}.{sys.implementation.cache_tag}"
         self._sources = sources
-        self._depends_on = (numba.__version__, platform.python_version(), sources, parts)
+        self._depends_on = (numba.__version__, platform.python_version(), sources, name)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compile result of a signature; None if there is no entry, or only a damaged one."""

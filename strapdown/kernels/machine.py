@@ -32,7 +32,7 @@ _SOURCES = {path.stem: path.read_bytes() for path in Path(__file__).parent.glob(
 """Read on import: if a source is edited later, the code of this process is not stored as that of the edited one."""
 _COMPILER = ("machine", "cache", "compiler", "tracing", "lanes", "addresses")
 """Modules on which the code of every kernel depends."""
-_IMPORTED = re.compile(rb"^\s*from strapdown\.kernels(?:\.(\w+) import| import (.+))", re.MULTILINE)
+_IMPORTED = re.compile(rb"^ *from strapdown\.kernels(?:\.(\w+) import| import (.+))", re.MULTILINE)
 
 
 @functools.cache
@@ -48,15 +48,11 @@ def sources_digest(*files: str) -> str:
 
     numba's own key misses edits of helper modules and constants.
     """
-    paths = [Path(file) for file in files]
-    inside = [path.stem for path in paths if path.parent == Path(__file__).parent]
-    digest = hashlib.sha256()
-    for name in sorted(frozenset[str]().union(*map(_used, (*_COMPILER, *inside)))):
-        digest.update(_SOURCES[name])
-    for path in paths:
-        if path.stem not in inside:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    here, paths = Path(__file__).parent, [Path(file) for file in files]
+    inside = [path.stem for path in paths if path.parent == here]
+    names = sorted(frozenset[str]().union(*map(_used, (*_COMPILER, *inside))))
+    contents = [_SOURCES[name] for name in names] + [path.read_bytes() for path in paths if path.parent != here]
+    return hashlib.sha256(b"".join(contents)).hexdigest()
 
 
 def _is_kernel(value: object) -> bool:
@@ -122,16 +118,23 @@ def _checked(
     return checked
 
 
+def _bound_name(function: FunctionType, parts: tuple[ModuleType, ...]) -> str:
+    """Return the qualified name of a function, with a digest of the bodies that it is bound to.
+
+    numba names symbols by the qualified name and a number that begins anew in each process: two bodies of a function, from the caches of
+    two processes, would have one name, and an address would be that of either.
+    """
+    digest = hashlib.sha256(" ".join(module.__name__ for module in parts).encode()).hexdigest()
+    return f"{function.__qualname__}_{digest[:16]}" if parts else function.__qualname__
+
+
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
     bound: dict[str, Any] = {name: helper(*checked) for name, checked in _checked(function, parts).items()}
     others = (name for name in _names(function.__code__) if name in function.__globals__ and name not in bound)
     bound |= {"__name__": function.__module__, **{name: function.__globals__[name] for name in others}}
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
-    # numba names symbols by the qualified name and a number that begins anew in each process: two bodies of a function, from the caches of
-    # two processes, would have one name, and an address would be that of either.
-    digest = hashlib.sha256(" ".join(module.__name__ for module in parts).encode()).hexdigest()
-    twin.__qualname__ = f"{function.__qualname__}_{digest[:16]}" if parts else function.__qualname__
+    twin.__qualname__ = _bound_name(function, parts)
     twin.__doc__ = function.__doc__
     return twin
 
@@ -204,7 +207,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     dispatcher = numba.njit(**options)(function)
     files = (function.__code__.co_filename, *(str(module.__file__) for module in parts))
     try:
-        dispatcher._cache = Cache(function, sources_digest(*files), tuple(module.__name__ for module in parts))
+        dispatcher._cache = Cache(function, _bound_name(function, parts), sources_digest(*files))
     except (RuntimeError, OSError):  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
