@@ -456,6 +456,20 @@ def test_recovery_over_200_records(name):
             assert result.relative_rms(term) < 0.1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("corner", "ramp"), [((1 << 17, 1000.0, 20.0), 0.0), ((1 << 14, 200.0, 20.0), 20.0)], ids=["long", "ramp"]
+)
+def test_intervals_cover_over_200_seeds(corner, ramp):
+    inside, supported, ratio = coverage(200, *corner, ramp=ramp)
+    share = inside.mean(axis=0)[: 5 if ramp else 4]
+    assert np.all((share >= 0.91) & (share <= 0.98)), share
+    if not ramp:
+        assert np.all(supported[:, :4])
+        assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
+        assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01
+
+
 def test_terms_that_are_not_there_are_bounded_not_invented():
     """Of twelve records; a slow study takes two hundred."""
     supported, below = np.zeros(5), np.zeros(5)
@@ -766,17 +780,3 @@ def test_the_units_of_the_coefficients_are_what_their_names_say():
             "nT s": (1e-9, 1e-9, 1e-9, 1e-9 / hour**0.5, 1e-9 / hour),
         }[names[0]]
         assert_allclose(factors, wanted, rtol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("corner", "ramp"), [((1 << 17, 1000.0, 20.0), 0.0), ((1 << 14, 200.0, 20.0), 20.0)], ids=["long", "ramp"]
-)
-def test_intervals_cover_over_200_seeds(corner, ramp):
-    inside, supported, ratio = coverage(200, *corner, ramp=ramp)
-    share = inside.mean(axis=0)[: 5 if ramp else 4]
-    assert np.all((share >= 0.91) & (share <= 0.98)), share
-    if not ramp:
-        assert np.all(supported[:, :4])
-        assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
-        assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01

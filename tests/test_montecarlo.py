@@ -18,6 +18,7 @@ from strapdown.montecarlo.coning_study import ConingParameters
 PARAMETERS = ConingParameters(duration=60.0)
 SCENARIO = PARAMETERS.scenario
 NOISE = ProcessNoise(angle_random_walk=coning_study.ANGLE_RANDOM_WALK, rate_random_walk=coning_study.RATE_RANDOM_WALK)
+EPOCHS = np.arange(5, 101, 5)
 
 
 def setup(algorithm="matched-4-11", noise=NOISE, **changes):
@@ -30,6 +31,69 @@ def setup(algorithm="matched-4-11", noise=NOISE, **changes):
     )
 
 
+def inside(statistics, subset, probability=0.99):
+    """Whether no more of the 20 epochs lie outside their own bounds than chance allows (binomial, once in 1000)."""
+    verdict = statistics.verdict(EPOCHS, subset, probability)
+    low, high = verdict.bounds
+    outside = np.sum((verdict.mean < low) | (verdict.mean > high))
+    return outside <= scipy.stats.binom.ppf(0.999, len(EPOCHS), 1.0 - probability)
+
+
+MOTIONS = {
+    "10 Hz coning": SCENARIO.motion,
+    "rest": motion.rest(),
+    "spinning at 2 rad/s": motion.ConstantRate(rate=(1.0, -1.5, 0.8)),
+}
+
+
+@pytest.mark.parametrize("name", ["10 Hz coning", "spinning at 2 rad/s"])
+def test_the_filter_is_as_good_as_it_says_over_100_runs(name):
+    algorithm = "matched-4-11" if "coning" in name else "one-sample"
+    (statistics,) = montecarlo.run(replace(SCENARIO, motion=MOTIONS[name]), (setup(algorithm),), runs=100, seed=3)
+    for subset in ("state", "attitude", "bias"):
+        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
+    low, high = statistics.nis_bounds()
+    assert low < statistics.mean_nis < high
+    # RMS error against the filter's own σ: (100 runs × 3 axes) at each epoch
+    ratio = np.sqrt((statistics.rms_error[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)) / np.sqrt(
+        (statistics.sigma[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)
+    )
+    assert np.all(np.abs(ratio - 1.0) < 4.5 / np.sqrt(2 * 100 * 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOTIONS)
+def test_the_filter_is_as_good_as_it_says_over_5000_runs(name):
+    algorithm = "matched-4-11" if "coning" in name else "one-sample"
+    long = ConingParameters(duration=240.0).scenario
+    (statistics,) = montecarlo.run(replace(long, motion=MOTIONS[name]), (setup(algorithm),), runs=5000, seed=4)
+    for subset in ("state", "attitude", "bias"):
+        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
+
+
+WRONG = {
+    "half the process noise": setup(
+        noise=ProcessNoise(
+            angle_random_walk=NOISE.angle_random_walk / np.sqrt(2.0),
+            rate_random_walk=NOISE.rate_random_walk / np.sqrt(2.0),
+        )
+    ),
+    "sigma 20 % too large": setup(measurement_sigma_factor=1.25),
+    "no coning correction": setup("one-sample"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_filter_is_found_out(name):
+    (statistics,) = montecarlo.run(SCENARIO, (WRONG[name],), runs=50, seed=5)
+    subset = "bias" if "coning" in name else "attitude"
+    verdict = statistics.verdict(EPOCHS, subset)
+    assert not verdict.consistent
+    # and on the side that it must be
+    too_sure = "half" in name or "coning" in name
+    assert (verdict.mean.mean() > 1.0) == too_sure
+
+
 def test_the_filter_is_consistent_from_large_errors_too():
     """Initial errors of 0.1 rad an axis, known to a fifth of that after one measurement."""
     sensors = tuple(replace(s, sigma=0.02, rate=25.0) for s in SCENARIO.sensors)
@@ -38,6 +102,28 @@ def test_the_filter_is_consistent_from_large_errors_too():
     (statistics,) = montecarlo.run(scenario, (big,), runs=100, seed=6)
     verdict = statistics.verdict(np.arange(1, 100, 5), "attitude")
     assert verdict.consistent, verdict.mean
+
+
+def test_statistics_are_plain_sums():
+    """Against the runs taken one by one through estimation.run."""
+    from strapdown import consistency
+    from strapdown.records import compress
+    from strapdown.scenarios import simulate
+
+    statistics = montecarlo.run(SCENARIO, (setup(),), runs=3, seed=9)[0]
+    nees, square = 0.0, 0.0
+    for run in range(3):
+        record = simulate(SCENARIO, 9, run)
+        short = compress(record, coning.ALGORITHMS["matched-4-11"])
+        every = len(short.increments) // 100
+        result = estimation.run(
+            short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True
+        )
+        e = errors(result, short.truth, every)
+        nees = nees + consistency.nees(e, result.covariance)
+        square = square + e**2
+    assert np.allclose(statistics.anees[:, 0], nees / 18.0, rtol=1e-12)
+    assert np.allclose(statistics.rms_error, np.sqrt(square / 3.0), rtol=1e-12)
 
 
 def test_the_start_is_drawn_from_the_prior():
@@ -104,91 +190,3 @@ def test_a_filter_that_is_no_setup_is_refused_by_name():
         InputError, match=r"setup is 'mekf', not of class FilterSetup; give estimation\.setup\.FilterSetup"
     ):
         sd.monte_carlo("two-stars", runs=2, setup="mekf")
-
-
-EPOCHS = np.arange(5, 101, 5)
-
-
-def inside(statistics, subset, probability=0.99):
-    """Whether no more of the 20 epochs lie outside their own bounds than chance allows (binomial, once in 1000)."""
-    verdict = statistics.verdict(EPOCHS, subset, probability)
-    low, high = verdict.bounds
-    outside = np.sum((verdict.mean < low) | (verdict.mean > high))
-    return outside <= scipy.stats.binom.ppf(0.999, len(EPOCHS), 1.0 - probability)
-
-
-MOTIONS = {
-    "10 Hz coning": SCENARIO.motion,
-    "rest": motion.rest(),
-    "spinning at 2 rad/s": motion.ConstantRate(rate=(1.0, -1.5, 0.8)),
-}
-
-
-@pytest.mark.parametrize("name", ["10 Hz coning", "spinning at 2 rad/s"])
-def test_the_filter_is_as_good_as_it_says_over_100_runs(name):
-    algorithm = "matched-4-11" if "coning" in name else "one-sample"
-    (statistics,) = montecarlo.run(replace(SCENARIO, motion=MOTIONS[name]), (setup(algorithm),), runs=100, seed=3)
-    for subset in ("state", "attitude", "bias"):
-        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
-    low, high = statistics.nis_bounds()
-    assert low < statistics.mean_nis < high
-    # RMS error against the filter's own σ: (100 runs × 3 axes) at each epoch
-    ratio = np.sqrt((statistics.rms_error[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)) / np.sqrt(
-        (statistics.sigma[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)
-    )
-    assert np.all(np.abs(ratio - 1.0) < 4.5 / np.sqrt(2 * 100 * 3))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MOTIONS)
-def test_the_filter_is_as_good_as_it_says_over_5000_runs(name):
-    algorithm = "matched-4-11" if "coning" in name else "one-sample"
-    long = ConingParameters(duration=240.0).scenario
-    (statistics,) = montecarlo.run(replace(long, motion=MOTIONS[name]), (setup(algorithm),), runs=5000, seed=4)
-    for subset in ("state", "attitude", "bias"):
-        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
-
-
-WRONG = {
-    "half the process noise": setup(
-        noise=ProcessNoise(
-            angle_random_walk=NOISE.angle_random_walk / np.sqrt(2.0),
-            rate_random_walk=NOISE.rate_random_walk / np.sqrt(2.0),
-        )
-    ),
-    "sigma 20 % too large": setup(measurement_sigma_factor=1.25),
-    "no coning correction": setup("one-sample"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_filter_is_found_out(name):
-    (statistics,) = montecarlo.run(SCENARIO, (WRONG[name],), runs=50, seed=5)
-    subset = "bias" if "coning" in name else "attitude"
-    verdict = statistics.verdict(EPOCHS, subset)
-    assert not verdict.consistent
-    # and on the side that it must be
-    too_sure = "half" in name or "coning" in name
-    assert (verdict.mean.mean() > 1.0) == too_sure
-
-
-def test_statistics_are_plain_sums():
-    """Against the runs taken one by one through estimation.run."""
-    from strapdown import consistency
-    from strapdown.records import compress
-    from strapdown.scenarios import simulate
-
-    statistics = montecarlo.run(SCENARIO, (setup(),), runs=3, seed=9)[0]
-    nees, square = 0.0, 0.0
-    for run in range(3):
-        record = simulate(SCENARIO, 9, run)
-        short = compress(record, coning.ALGORITHMS["matched-4-11"])
-        every = len(short.increments) // 100
-        result = estimation.run(
-            short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True
-        )
-        e = errors(result, short.truth, every)
-        nees = nees + consistency.nees(e, result.covariance)
-        square = square + e**2
-    assert np.allclose(statistics.anees[:, 0], nees / 18.0, rtol=1e-12)
-    assert np.allclose(statistics.rms_error, np.sqrt(square / 3.0), rtol=1e-12)

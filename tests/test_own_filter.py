@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from strapdown.montecarlo import Plan, campaign, verdicts
 from strapdown.records import Estimate, Truth
 from strapdown.report import campaigns
 
+ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = own_filter.scenario(20.0)
 SETUP = setup.FilterSetup.for_scenario(SCENARIO, states=False)
 PLAN = Plan(scenario=SCENARIO, setup=SETUP, seed=3, epochs=20, nis_bins=5)
@@ -397,6 +399,18 @@ def cramer_rao(scene, attitude_sigma, bias_sigma, epochs):
     return covariance.analyse(scene, chosen, epochs=epochs).cramer_rao
 
 
+def test_the_bound_ends_in_farrenkopfs_steady_state():
+    """Farrenkopf 1978, one axis at rest, just after an update."""
+    su, sv, sn, dt = 1e-6, 1e-5, 1e-4, 1.0
+    S_u, S_v = su * dt**1.5 / sn, sv * dt**0.5 / sn
+    gamma = np.sqrt(1.0 + S_v**2 / 4.0 + S_u**2 / 48.0)
+    zeta = gamma + S_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * S_u + S_v**2 + S_u**2 / 3.0)
+    bound = cramer_rao(star_tracker(), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
+    variances = [sn**2 * (1.0 - zeta**-2)] * 3 + [su * sn / np.sqrt(dt) * (zeta - 1.0 / zeta) - 0.5 * su**2 * dt] * 3
+    np.testing.assert_allclose(np.diag(bound[-1]), variances, rtol=1e-8)
+    np.testing.assert_allclose(np.diag(bound[0]), [1e-6] * 3 + [1e-10] * 3, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "gyro", [{"bias_instability": 1e-6}, {"rate_random_walk": (1e-6, 1e-6, 3e-6)}], ids=["flicker", "axes"]
 )
@@ -472,15 +486,3 @@ def test_a_comparison_gives_errors_over_the_bound():
         record = replace(one.record, truth=None) if message == "no truth" else one.record
         with pytest.raises(InputError, match=message):
             filters.compare(record, base.process_noise, one.initial, filters=["mekf"], every=2, bound=bad)
-
-
-def test_the_bound_ends_in_farrenkopfs_steady_state():
-    """Farrenkopf 1978, one axis at rest, just after an update."""
-    su, sv, sn, dt = 1e-6, 1e-5, 1e-4, 1.0
-    S_u, S_v = su * dt**1.5 / sn, sv * dt**0.5 / sn
-    gamma = np.sqrt(1.0 + S_v**2 / 4.0 + S_u**2 / 48.0)
-    zeta = gamma + S_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * S_u + S_v**2 + S_u**2 / 3.0)
-    bound = cramer_rao(star_tracker(), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
-    variances = [sn**2 * (1.0 - zeta**-2)] * 3 + [su * sn / np.sqrt(dt) * (zeta - 1.0 / zeta) - 0.5 * su**2 * dt] * 3
-    np.testing.assert_allclose(np.diag(bound[-1]), variances, rtol=1e-8)
-    np.testing.assert_allclose(np.diag(bound[0]), [1e-6] * 3 + [1e-10] * 3, rtol=1e-12)
