@@ -10,7 +10,7 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
-from strapdown.kernels import recording_samples
+from strapdown.kernels import first_state, recording_samples
 from strapdown.kernels import rests as kernel
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.rotation import moved, unit
@@ -125,20 +125,29 @@ def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> es
     """
     assert recording.specific_force is not None
     force = first_vector(recording.specific_force, turned, recording.source, "accelerometer")
-    moved = float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0
-    swing = SWING_TIME * float(np.linalg.norm(recording.rate[0]))
-    tilt = min(float(np.linalg.norm([parameters.attitude_sigma, moved, swing])), MAX_TILT_SIGMA)
-    P = np.diag(np.repeat([tilt**2, parameters.bias_sigma**2], 3))
     across = np.eye(3)[np.argmin(np.abs(force))]
     if recording.magnetic_field is not None:
         across = first_vector(recording.magnetic_field, turned, recording.source, "magnetometer")
-    attitude = wahba.from_vertical_and_heading(force, across)
+    attitude, constants = wahba.from_vertical_and_heading(force, across), start_constants(parameters)
+    tilt = first_state.tilt_variance(constants, force.tolist(), recording.rate[0].tolist())
+    P = np.diag(np.repeat([tilt, parameters.bias_sigma**2], 3))
     if recording.magnetic_field is not None:
         up = force / np.linalg.norm(force)
-        sine = float(up @ across) / float(np.linalg.norm(across))
-        level = max(1.0 - sine**2, MIN_LEVEL)
-        P[:3, :3] += np.outer(up, up) * ((sine * tilt) ** 2 + FIRST_HEADING**2) / level
+        sine = first_state.sine_of_dip(force.tolist(), across.tolist())
+        P[:3, :3] += np.outer(up, up) * first_state.heading_variance(constants, sine, tilt)
     return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
+
+
+def start_constants(parameters: AhrsParameters) -> first_state.Constants:
+    """Return the constants of the variances at the start."""
+    return first_state.Constants(
+        attitude_sigma=parameters.attitude_sigma,
+        max_tilt_sigma=MAX_TILT_SIGMA,
+        swing_time=SWING_TIME,
+        gravity=STANDARD_GRAVITY,
+        min_level=MIN_LEVEL,
+        field_sigma=FIRST_HEADING,
+    )
 
 
 class Rests(NamedTuple):

@@ -16,11 +16,10 @@ import numpy as np
 from strapdown.ahrs import regions, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.codegen import program as body
-from strapdown.kernels import headings, live_imu, rests
-from strapdown.kernels.algebra import cross, dot, scale, square_root
+from strapdown.kernels import first_state, headings, live_imu, rests
+from strapdown.kernels.algebra import dot
 from strapdown.kernels.live_imu import Imu
 from strapdown.kernels.rotation import unit
-from strapdown.units import STANDARD_GRAVITY
 
 MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
@@ -260,65 +259,27 @@ def begin(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, vector
     for vector in vectors:
         present = present & (dot(vector, vector) > 0.0)
     m.unless(present, lambda: m.leave("NOT_STARTED"))
-    size = m.root(dot(force, force))
-    up = scale(1.0 / size, force)
-    north = m.kernel(least_axis, force)
-    level = 1.0
+    constants, sine = starting.start_constants(r.parameters), 0.0
     if r.magnetometer:
-        north = scale(1.0 / m.root(dot(vectors[1], vectors[1])), vectors[1])
-        sine = dot(up, north)
-        level = 1.0 - sine * sine
-        m.unless(level > MIN_HORIZONTAL_SQUARED, lambda: m.leave("NO_HEADING"))
-    q = m.kernel(first_attitude, up, north)
-    moved, swing = size / STANDARD_GRAVITY - 1.0, starting.SWING_TIME * m.root(dot(gyro, gyro))
-    tilt = m.root(r.parameters.attitude_sigma**2 + moved * moved + swing * swing)
-    tilt = m.select(tilt < starting.MAX_TILT_SIGMA, tilt, starting.MAX_TILT_SIGMA)
-    heading = 0.0
-    if r.magnetometer:
-        steep = m.select(level > starting.MIN_LEVEL, level, starting.MIN_LEVEL)
-        heading = (sine * sine * (tilt * tilt) + starting.FIRST_HEADING**2) / steep
+        sine = m.kernel(first_state.sine_of_dip, *vectors)
+        m.unless(1.0 - sine * sine > MIN_HORIZONTAL_SQUARED, lambda: m.leave("NO_HEADING"))
+    up, across = m.kernel(first_state.direction, force), vectors[-1]
+    if not r.magnetometer:
+        across = m.kernel(first_state.least_axis, force)
+    q = m.kernel(first_state.first_attitude, force, across)
+    tilt = m.kernel(first_state.tilt_variance, constants, force, gyro)
+    heading = m.kernel(first_state.heading_variance, constants, sine, tilt) if r.magnetometer else 0.0
+    iron = m.kernel(first_state.iron_variance, r.parameters.iron_sigma, sine) if r.magnetometer else 0.0
     for i in range(4):
         f.x[i] = q[i]
     for i in range(3):
         for j in range(i, 3):
-            own = tilt * tilt if i == j else 0.0
-            f.P[body.place(program.n, i, j)] = up[i] * up[j] * heading + own
-    f.iron_variance[0] = r.parameters.iron_sigma**2 / m.select(level > 1e-12, level, 1e-12) if r.magnetometer else 0.0
+            f.P[body.place(program.n, i, j)] = up[i] * up[j] * heading + (tilt if i == j else 0.0)
+    f.iron_variance[0] = iron
     if r.imu.rests:
         f.rest_clock[1] = time
     m.kernel(live_imu.start, m.imu)
     m.leave("OK")
-
-
-def least_axis(v: Any) -> Any:
-    """Return the axis to which a vector has the smallest component."""
-    x, y, z = abs(v[0]), abs(v[1]), abs(v[2])
-    if x <= y and x <= z:
-        return (1.0, 0.0, 0.0)
-    if y <= z:
-        return (0.0, 1.0, 0.0)
-    return (0.0, 0.0, 1.0)
-
-
-def first_attitude(up: Any, north: Any) -> Any:
-    """Return the attitude in East, North, up axes by TRIAD, from unit vectors in body axes."""
-    east = cross(north, up)
-    e = scale(1.0 / square_root(dot(east, east)), east)
-    n, u = cross(up, e), up
-    a, b = 1.0 + (e[0] + n[1] + u[2]), 1.0 + (e[0] - n[1] - u[2])
-    c, d = 1.0 + (n[1] - e[0] - u[2]), 1.0 + (u[2] - e[0] - n[1])
-    if a >= b and a >= c and a >= d:
-        q = (a, u[1] - n[2], e[2] - u[0], n[0] - e[1])
-    elif b >= c and b >= d:
-        q = (u[1] - n[2], b, n[0] + e[1], e[2] + u[0])
-    elif c >= d:
-        q = (e[2] - u[0], n[0] + e[1], c, u[1] + n[2])
-    else:
-        q = (n[0] - e[1], e[2] + u[0], u[1] + n[2], d)
-    q = unit(q)
-    if q[0] < 0.0:
-        q = (-q[0], -q[1], -q[2], -q[3])
-    return q
 
 
 # -------------------------------------------------------------------------------------------------------------------------------- rest
