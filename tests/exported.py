@@ -8,7 +8,7 @@ import math
 import shutil
 import subprocess
 from pathlib import Path
-from types import FunctionType, SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,6 +16,8 @@ import pytest
 
 from strapdown.codegen import c, design, recording
 from strapdown.codegen import program as body
+from strapdown.codegen.interpreted import FORMULAS
+from strapdown.codegen.target import OWN
 from strapdown.kernels import machine
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic", "-ffp-contract=off")
@@ -32,145 +34,101 @@ def compiler(language="C"):
 missing = (0.0, 0.0, 0.0)
 
 
-class PlainKernels:
-    """Kernels in plain Python, with other helpers."""
+class PlainModule:
+    """A module of the filter's functions in plain Python, with others in place of some."""
 
-    def __init__(self, module, helpers):
-        self.module, self.made = module, {}
-        self.helpers = helpers | {
+    def __init__(self, module, replaced, called):
+        self.module, self.made, self.called = module, {}, called
+        self.replaced = replaced | {
             "value_at": lambda array, i, like: array[i],
             "put_at": lambda array, i, value: array.__setitem__(i, value),
         }
 
     def __getattr__(self, name):
-        value = getattr(self.module, name)
-        return self.bound(value) if isinstance(value, FunctionType) else value
+        return self.bound(getattr(self.module, name))
 
-    def bound(self, kernel):
-        if kernel not in self.made:
-            names = kernel.__globals__ | self.helpers
-            self.made[kernel] = FunctionType(kernel.__code__, names, kernel.__name__, kernel.__defaults__)
-            for name in machine._names(kernel.__code__):
-                value = names.get(name)
-                if name not in self.helpers and getattr(value, "__module__", "").startswith("strapdown.kernels"):
-                    names[name] = self.bound(value) if isinstance(value, FunctionType) else value
-        return self.made[kernel]
+    def bound(self, value):
+        if isinstance(value, ModuleType) and value.__name__.startswith(FORMULAS):
+            module = PlainModule(value, self.replaced, self.called)
+            module.made = self.made
+            return module
+        if not isinstance(value, FunctionType) or not value.__module__.startswith(FORMULAS):
+            return value
+        if value not in self.made:
+            names = dict(value.__globals__)
+            function = FunctionType(value.__code__, names, value.__name__, value.__defaults__)
+            self.made[value] = self.recorded(function) if value in OWN else function
+            for name in machine._names(value.__code__):
+                if name in self.replaced or name in names:
+                    names[name] = self.bound(self.replaced.get(name, names.get(name)))
+        return self.made[value]
 
+    def recorded(self, function):
+        def call(*arguments):
+            sensors = [x.name for x in arguments if isinstance(x, body.Sensor)]
+            self.called.add("_".join([function.__name__, *sensors]))
+            return function(*arguments)
 
-class LeftError(Exception):
-    """A function of the filter has returned a status."""
+        return call
 
 
 class Plain:
-    """The program on floats of Python: the machine of :mod:`strapdown.codegen.program` without code."""
+    """The filter on floats of Python."""
 
     def __init__(self, program):
         self.program, n = program, program.n
-        helpers = {
+        self.called, self.far_turns, self.status = set(), 0, 0
+        replaced = {
             "square_root": math.sqrt,
             "select": lambda condition, a, b: a if condition else b,
             "any_lane": self.turned_far,
         }
-        self.kernels = PlainKernels(program.kernels, helpers)
-        self.select, self.root, self.equal = helpers["select"], math.sqrt, lambda a, b: a == b
-        self.whole, self.scratch = math.floor, dict
-        self.f = SimpleNamespace(
+        self.f = f = SimpleNamespace(
+            program=program,
+            kernels=PlainModule(program.kernels, replaced, self.called),
             x=[0.0] * (n + 1),
             P=[0.0] * program.number_of_covariances,
             nis=[0.0] * len(program.sensors),
             coefficients=[0.0] * (16 * len(program.model.last)),
             dt=[0.0],
+            status=[0],
+            work=[0.0] * body.work_size(program.kernels),
         )
-        for a in () if program.recording is None else program.recording.arrays:
-            setattr(self.f, a.name, np.zeros(a.shape, int if a.kind == "int" else float))
-        self.state, self.imu = self.f, None
+        replaced = recording.REPLACED | {"call": lambda kernel, arguments, like: self.body.bound(kernel)(*arguments)}
+        self.body = PlainModule(body if program.recording is None else recording, replaced, self.called)
         if program.recording is not None:
-            self.imu = recording.imu_of(self)
-            self.on_target = PlainKernels(None, recording.helpers(self))
-        self.lowest = math.floor
-        self.status, self.called, self.far_turns = 0, set(), 0
+            for a in program.recording.arrays:
+                setattr(f, a.name, np.zeros(a.shape, int if a.kind == "int" else float))
+            f.imu = recording.imu_of(f, lambda name, shape: np.zeros(shape), np.zeros_like)
 
     def turned_far(self, condition):
         self.far_turns += bool(condition)
         return bool(condition)
 
     def run(self, function, *arguments):
-        try:
-            function(self, self.program, self.f, *arguments)
-        except LeftError as left:
-            bits = int(self.program.statuses[str(left)][0])
-            self.status |= bits
-            return bits
-        return None
+        self.f.status[0] = self.status
+        status = function(self.f, *arguments)
+        self.status = self.f.status[0] | status
+        return status
 
     def start(self):
-        return self.run(recording.init)
+        return self.run(self.body.init)
 
     def take(self, time, *vectors):
-        return self.run(recording.update, time, *(missing if v is None else tuple(v) for v in vectors))
+        return self.run(self.body.update, time, *(missing if v is None else tuple(v) for v in vectors))
 
     def init(self, attitude):
-        return self.run(body.init, attitude)
+        return self.run(self.body.init, attitude)
 
     def predict(self, gyro, dt):
-        return self.run(body.predict, tuple(gyro), dt)
+        return self.run(self.body.predict, tuple(gyro), dt)
 
     def update(self, i, value):
-        return self.run(body.update, self.program.sensors[i], i, tuple(value))
+        return self.run(self.body.update, self.program.sensors[i], tuple(value))
 
     @property
     def numbers(self):
         return np.array([*self.f.x, *self.f.P, *self.f.nis])
-
-    # The machine of the program.
-
-    def branch(self, condition, then, otherwise=None):
-        if condition:
-            then()
-        elif otherwise is not None:
-            otherwise()
-
-    def unless(self, condition, then):
-        if not condition:
-            then()
-
-    def no(self, condition):
-        return not condition
-
-    def repeat(self, count, then):
-        for _ in range(int(count)):
-            then()
-
-    def comment(self, text):
-        pass
-
-    def kernel(self, function, *arguments):
-        return self.on_target.bound(function)(*arguments) if self.imu else function(*arguments)
-
-    def local(self, name, shape):
-        return np.zeros(shape)
-
-    def passing(self, like):
-        return np.zeros_like(like)
-
-    def clear_status(self):
-        self.status = 0
-
-    def leave(self, status):
-        raise LeftError(status)
-
-    def work(self):
-        self.space = [0.0] * body.work_size(self.kernels)
-        return self.space
-
-    def call(self, name, *arguments, result=None):
-        self.called.add(name)
-        given = tuple(self.space if isinstance(argument, str) else argument for argument in arguments)
-        sensor = [one for one in enumerate(self.program.sensors) if name == f"update_{one[1].name}"]
-        if sensor:
-            index, one = sensor[0]
-            return self.run(body.update, one, index, *given)
-        return self.run(getattr(body, name, None) or getattr(recording, name), *given)
 
 
 class Compiled:

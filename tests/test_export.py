@@ -183,7 +183,7 @@ def test_the_cases_take_the_rare_branches():
         assert statuses.count(0) > 0.9 * len(statuses)
         assert (2 in statuses) == (name == "gate")
         assert f.far_turns > 0
-        assert f.called == {"step", "subtract", "take_row", "apply_step"}
+        assert {"step", "subtract", "take_row", "apply_step"} <= f.called
 
 
 def sources(name):

@@ -66,7 +66,9 @@ def signature(function: Target) -> str:
 
 def may_be_missing(function: Target) -> list[str]:
     """Return the parameters that may be null."""
-    return [name for name, _ in function.parameters if name in ("accelerometer", "magnetometer")]
+    return [
+        name for name, _ in function.parameters if is_public(function) and name in ("accelerometer", "magnetometer")
+    ]
 
 
 def constant_of(sensor: Sensor) -> str:

@@ -23,7 +23,7 @@ class Statement:
     """A statement: what it is, the symbols that it needs, and blocks inside it."""
 
     kind: str
-    """``"store"``, ``"put"``, ``"if"``, ``"repeat"``, ``"for"``, ``"loop"``, ``"break"``, ``"call"``, ``"return"``, ``"comment"``,
+    """``"store"``, ``"put"``, ``"if"``, ``"for"``, ``"loop"``, ``"break"``, ``"call"``, ``"return"``, ``"comment"``,
     ``"array"`` or ``"variable"``."""
     text: str = ""
     """Name of the called function, of the status returned, of an array; or a comment."""
@@ -102,7 +102,7 @@ class Variable(Values):
 
 
 class Function:
-    """A function of the target; its methods are those that :mod:`strapdown.codegen.program` asks of a machine."""
+    """A function of the target."""
 
     def __init__(self, name: str, parameters: Sequence[tuple[str, Any]], *, returns: str = "") -> None:
         self.name, self.parameters, self.returns = name, parameters, returns
@@ -211,27 +211,21 @@ class Function:
         elif not condition:
             body()
 
-    def repeat(self, count: Any, body: Callable[[], None]) -> None:
-        """Execute a body ``count`` times, rounded up."""
-        self.flush()
-        block = Block(self.block)
-        self.add(Statement("repeat", values=(count,), blocks=[block]))
-        self.inside(block, body)
-
     def leave_loop(self) -> None:
         """Leave the innermost loop."""
         self.flush()
         self.add(Statement("break"))
 
     def call(self, name: str, *arguments: Any, result: str | None = None) -> Any:
-        """Call another function of the filter: symbols, tuples and local arrays are its arguments; ``result``: type of its result."""
+        """Call another function of the filter with numbers, tuples of them and local arrays; ``result``: type of its result."""
         self.flush()
         self.calls += 1
         value = None
         if result is not None:
             value = self.trace.symbol("result", name, self.calls)
             value.type = result
-        self.add(Statement("call", name, values=arguments, result=value))
+        values = [x.base if isinstance(x, Member) else x for x in arguments]
+        self.add(Statement("call", name, values=values, result=value))
         for array in self.trace.arrays:
             array.forget()
         return value

@@ -1,8 +1,7 @@
-"""Kernels executed statement by statement on symbols.
+"""Functions of a filter, its kernels among them, executed statement by statement on symbols.
 
 Their ``if``, ``while`` and ``for`` become those of the target, unless what decides them is known while tracing. A name that a branch or a
-loop changes is a variable of the target afterwards. Kernels in ``OWN`` become functions of the target, others are written where they are
-called.
+loop changes is a variable of the target afterwards. Some become functions of the target, others are written where they are called.
 """
 
 from __future__ import annotations
@@ -13,16 +12,16 @@ import inspect
 import math
 import operator
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import FunctionType, SimpleNamespace
+from types import FunctionType, MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from strapdown.codegen.functions import Block, Statement
-from strapdown.codegen.symbols import KERNELS, Symbol, Trace
+from strapdown.codegen.symbols import Symbol, Trace
 
-OWN = ("look", "insert", "iron_step")
-"""Kernels that are called several times, or return early; their arguments are numbers, vectors, and what is the same for all calls."""
+FORMULAS = ("strapdown.kernels", "strapdown.codegen")
+"""Packages of functions that are executed on symbols."""
 LOOPING = ("turned_by", "take_row", "minus_outer_by_elements")
 """Kernels of the filter with loops of the target."""
 LONGEST_UNROLLED = 12
@@ -103,10 +102,10 @@ def code_of(node: ast.expr) -> tuple[Any, tuple[str, ...]]:
 
 
 def assigned(statements: Sequence[ast.stmt]) -> set[str]:
-    """Return the names that statements assign."""
-    return {
-        x.id for s in statements for x in ast.walk(s) if isinstance(x, ast.Name) and not isinstance(x.ctx, ast.Load)
-    }
+    """Return the names that statements assign, but not those that only count or name the elements of a loop."""
+    nodes = [x for s in statements for x in ast.walk(s)]
+    loops = {id(x) for node in nodes if isinstance(node, ast.For) for x in ast.walk(node.target)}
+    return {x.id for x in nodes if isinstance(x, ast.Name) and not isinstance(x.ctx, ast.Load) and id(x) not in loops}
 
 
 def contains(statements: Sequence[ast.stmt], kinds: tuple[type, ...]) -> bool:
@@ -155,34 +154,58 @@ def mathematics(trace: Trace) -> dict[str, Any]:
     }
 
 
+def executed(value: Any, execute: Callable[..., Any]) -> Any:
+    """Return a function of the filter, or a module of such functions, so that a call executes it on symbols; other values as they are."""
+    if isinstance(value, FunctionType) and value.__module__.startswith(FORMULAS):
+        return functools.partial(execute, value)
+    return Module(value, execute) if isinstance(value, ModuleType) and value.__name__.startswith(FORMULAS) else value
+
+
+class Module:
+    """A module whose functions are executed on symbols."""
+
+    def __init__(self, module: ModuleType, execute: Callable[..., Any]) -> None:
+        self.module, self.execute = module, execute
+
+    def __getattr__(self, name: str) -> Any:
+        return executed(getattr(self.module, name), self.execute)
+
+
 class Interpreter:
     """Executes kernels for a function of the target."""
 
-    def __init__(self, m: Any, helpers: dict[str, Callable[..., Any]]) -> None:
+    def __init__(
+        self,
+        m: Any,
+        helpers: Mapping[str, Callable[..., Any]],
+        own: Collection[FunctionType] = (),
+        replaced: Mapping[str, FunctionType] = MappingProxyType({}),
+    ) -> None:
         self.m, self.trace = m, m.trace
-        self.helpers = mathematics(m.trace) | {"range": self._range} | helpers
+        self.helpers = {**mathematics(m.trace), "range": self._range, **helpers}
+        """What is called by these names, on symbols."""
+        self.own, self.replaced = own, replaced
+        """Functions that become functions of the target; functions that are executed instead of others of the same names."""
         self.outer = False
         """Whether the kernel is the function of the target, which may return anywhere."""
         self.loops = True
         """Whether long loops are loops of the target."""
+        self.of_filter = False
+        """Whether the function is no kernel, but one that is written for the target: its loops are not."""
 
     def _range(self, *bounds: Any) -> Any:
         if len(bounds) == 3:
             return range(*bounds)
         start, stop = bounds if len(bounds) == 2 else (0, bounds[0])
         known = not isinstance(start, Symbol) and not isinstance(stop, Symbol)
-        unrolled = known and (not self.loops or stop - start <= LONGEST_UNROLLED)
+        unrolled = known and (not self.loops or self.of_filter or stop - start <= LONGEST_UNROLLED)
         return range(start, stop) if unrolled else Range(start, stop)
 
     def __call__(self, function: FunctionType, *arguments: Any) -> Any:
         """Return the result of a kernel."""
-        if function.__name__ in OWN:
+        if function in self.own:
             return self._call_own(function, arguments)
-        before = self.outer, self.loops
-        self.outer, self.loops = False, self.loops or function.__name__ in LOOPING
-        result = self._body(function, arguments)
-        self.outer, self.loops = before
-        return result
+        return self._body(function, arguments)
 
     def unrolled(self, function: FunctionType, *arguments: Any) -> Any:
         """Return the result of a kernel whose loops are written one repetition after the other, except in those of ``LOOPING``."""
@@ -191,12 +214,16 @@ class Interpreter:
         self.loops = before
         return result
 
-    def _body(self, function: FunctionType, arguments: Sequence[Any]) -> Any:
+    def _body(self, function: FunctionType, arguments: Sequence[Any], *, outer: bool = False) -> Any:
+        before = self.outer, self.loops, self.of_filter
+        self.outer, self.loops = outer, self.loops or function.__name__ in LOOPING
+        self.of_filter = function.__module__.startswith(FORMULAS[1])
         node = parsed(function)
         names, defaults = [a.arg for a in node.args.args], function.__defaults__ or ()
         env = dict(zip(names, (*arguments, *defaults[len(arguments) + len(defaults) - len(names) :]), strict=True))
         env["_globals_"] = function.__globals__
         result = self._statements(list(node.body), env)
+        self.outer, self.loops, self.of_filter = before
         return result[0] if result else None
 
     def _value(self, node: ast.expr, env: dict[str, Any]) -> Any:
@@ -209,9 +236,7 @@ class Interpreter:
             elif name in self.helpers:
                 names[name] = self.helpers[name]
             elif name in env["_globals_"]:
-                value = env["_globals_"][name]
-                kernel = isinstance(value, FunctionType) and value.__module__.startswith(KERNELS)
-                names[name] = functools.partial(self, value) if kernel else value
+                names[name] = executed(self.replaced.get(name, env["_globals_"][name]), self)
         try:
             return eval(code, names)
         except Exception as error:
@@ -226,9 +251,10 @@ class Interpreter:
             node = items.pop(0)
             if isinstance(node, Bind):
                 self._assign(node.target, node.value, env)
-            elif isinstance(node, ast.Assign):
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                assert node.value is not None
                 value = self._value(node.value, env)
-                for target in node.targets:
+                for target in [node.target] if isinstance(node, ast.AnnAssign) else node.targets:
                     self._assign(target, value, env)
             elif isinstance(node, ast.AugAssign):
                 self._assign(node.target, self._augmented(node, env), env)
@@ -363,7 +389,7 @@ class Interpreter:
 
     def _count(self, values: Range, node: ast.For, env: dict[str, Any]) -> None:
         assert isinstance(node.target, ast.Name)
-        name = self.m.new_name(node.target.id)
+        name = self.m.new_name(node.target.id.strip("_") or "i")
         statement = Statement("for", name, values=(values.start, values.stop))
         counter = self.trace.symbol("parameter", name)
         counter.type = "int"
@@ -407,37 +433,38 @@ class Interpreter:
     # ------------------------------------------------------------------------------------------------------ functions of the target
 
     def _call_own(self, function: FunctionType, arguments: Sequence[Any]) -> Any:
-        m, name = self.m, function.__name__
+        m = self.m
         names = [a.arg for a in parsed(function).args.args]
-        numbers = {n: a for n, a in zip(names, arguments, strict=True) if type(a) is tuple or is_number(a)}
+        known = dict(zip(names, arguments, strict=False))
+        passed = {n: x for n, x in known.items() if type(x) is tuple or is_number(x) or n == "work"}
+        name = m.name_of(function, known)
         if name not in m.functions:
-            m.functions[name] = None
-            parameters = [(n, len(a) if type(a) is tuple else m.type_of(a)) for n, a in numbers.items()]
-            words = (function.__doc__ or "").split("\n")[0]
-            target = m.another(name, parameters, words)
-            operands = [target.argument(n) if n in numbers else target.spaces[n] for n in names]
-            target.kernel.outer = True
-            result = target.kernel._body(function, operands)
-            if isinstance(result, tuple):
-                target.parameters = [*parameters, ("result", -len(result))]
-                out = target.array(lambda i: f"result[{i}]")
-                for i, value in enumerate(result):
-                    out[i] = value
-                target.flush()
-            elif result is not None:
-                target.returns = "real"
-                target.give(result)
-            else:
-                target.flush()
-            del m.functions[name]
-            m.functions[name] = target, len(result) if isinstance(result, tuple) else 0
+            sizes = {
+                n: len(x) if type(x) is tuple else -len(x) if n == "work" else m.type_of(x) for n, x in passed.items()
+            }
+            m.define(function, name, sizes, known)
         target, size = m.functions[name]
         if not size:
-            return m.call(name, *numbers.values(), result="" if target.returns == "real" else None)
+            result = {"": None, "real": ""}.get(target.returns, target.returns)
+            return m.call(name, *passed.values(), result=result)
         variable, declaration = m.variable(name, (0.0,) * size)
         m.add(declaration)
-        m.call(name, *numbers.values(), variable.base)
+        m.call(name, *passed.values(), variable.base)
         return variable.value()
+
+    def trace_function(self, function: FunctionType, arguments: Sequence[Any]) -> int:
+        """Execute a function as the one of the target; return the number of its results, if they are several."""
+        m, result = self.m, self._body(function, arguments, outer=True)
+        if isinstance(result, tuple):
+            m.parameters = [*m.parameters, ("result", -len(result))]
+            out = m.array(lambda i: f"result[{i}]")
+            for i, value in enumerate(result):
+                out[i] = value
+        elif result is not None:
+            m.returns = m.returns or "real"
+            m.give(result)
+        m.flush()
+        return len(result) if isinstance(result, tuple) else 0
 
 
 def is_number(value: Any) -> bool:

@@ -1,18 +1,18 @@
 """The filter sample by sample, as it runs on the target: the formulas of :mod:`strapdown.kernels.filter` with checks, flags and a gate.
 
-Every function here asks a *machine* ``m`` for what depends on it: branches, calls, flags. Executed on symbols
-(:class:`strapdown.codegen.functions.Function`) it writes a function of the target; executed on floats it is the same filter in Python.
+These are plain functions of a filter ``f``: arrays of its state, and what is known while it is exported. Executed on symbols by
+:mod:`strapdown.codegen.interpreted` they become functions of the target; those that return a status set its flag too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine
-from strapdown.kernels.algebra import dot, scale
+from strapdown.kernels.algebra import dot, scale, square_root
 from strapdown.kernels.filter import ROWS_OF_KIND
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
 from strapdown.kernels.rotation import far_turn as far_turn_kernel
@@ -32,18 +32,23 @@ LONGEST_SQUARED = 1e24
 UNIT = 2e-6
 """A direction whose squared length differs from 1 by less than this is used as it is, as in :class:`strapdown.estimation.LiveFilter`."""
 
-NOT_STARTED = {"NOT_STARTED": ("16", "Waits for a sample with a specific force and, with a magnetometer, a field.")}
-STATUS = {
-    "OK": ("0", "The sample was used."),
+OK, BAD_INPUT, REJECTED, NO_HEADING, TOO_PRECISE, NOT_STARTED = 0, 1, 2, 4, 8, 16
+"""Statuses."""
+MEANINGS = {
+    "OK": (OK, "The sample was used."),
     "BAD_INPUT": (
-        "1",
+        BAD_INPUT,
         "Not a number, infinite, no length, dt not in (0, 3600] s, or a turn of over 100 rad: not used.",
     ),
-    "REJECTED": ("2", "The gate refused the measurement: not used."),
-    "NO_HEADING": ("4", "The vector was vertical and has no heading: not used."),
-    "TOO_PRECISE": ("8", "So much more precise than the state that the covariance would keep no digits: not used."),
+    "REJECTED": (REJECTED, "The gate refused the measurement: not used."),
+    "NO_HEADING": (NO_HEADING, "The vector was vertical and has no heading: not used."),
+    "TOO_PRECISE": (
+        TOO_PRECISE,
+        "So much more precise than the state that the covariance would keep no digits: not used.",
+    ),
+    "NOT_STARTED": (NOT_STARTED, "Waits for a sample with a specific force and, with a magnetometer, a field."),
 }
-"""Statuses: their bits, and what they mean."""
+"""Their names, and what they mean."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,9 +97,11 @@ class Program:
     """Of the filter of an IMU: :class:`strapdown.codegen.recording.Recording`."""
 
     @property
-    def statuses(self) -> dict[str, tuple[str, str]]:
-        """Statuses: their bits, and what they mean."""
-        return STATUS if self.recording is None else STATUS | NOT_STARTED
+    def statuses(self) -> dict[str, tuple[int, str]]:
+        """Statuses of this filter: their bits, and what they mean."""
+        return {
+            name: meaning for name, meaning in MEANINGS.items() if name != "NOT_STARTED" or self.recording is not None
+        }
 
     @property
     def kernels(self) -> ModuleType:
@@ -129,172 +136,173 @@ def place(n: int, i: int, j: int) -> int:
     return i * n - i * (i - 1) // 2 + j - i
 
 
-def far_turn(m: Any, program: Program, f: SimpleNamespace, x: Any, y: Any, z: Any, turn: Any) -> None:
+def far_turn(x: Any, y: Any, z: Any, turn: Any) -> None:
     """Quaternion and Jacobian of a rotation vector of any size, by doubling."""
-    q, J = m.kernel.unrolled(far_turn_kernel, (x, y, z))
+    q, J = far_turn_kernel((x, y, z))
     for i, value in enumerate((*q, *J)):
         turn[i] = value
+
+
+def comment(text: str) -> None:
+    """Write a comment on the target."""
+
+
+def whole(x: Any) -> Any:
+    """Return x rounded down."""
+    return int(x)
 
 
 # ------------------------------------------------------------------------------------------------------------------------- prediction
 
 
-def predict(m: Any, program: Program, f: SimpleNamespace, gyro: Any, dt: Any) -> None:
+def predict(f: Any, gyro: Any, dt: Any) -> Any:
     """Propagate over a gyro sample: the mean rate over the last dt."""
-    propagate(m, program, f, scale(dt, gyro), dt)
+    return propagate(f, scale(dt, gyro), dt)
 
 
-def propagate(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
+def propagate(f: Any, delta: Any, dt: Any) -> Any:
     """Propagate over a rotation."""
-    turn = turn_squared(delta, dt, tuple(f.x[4 + i] for i in range(3)))
-    limit = program.model.limit
-    within = turn <= SQUARED_RANGE
-    usable = (dt > 0.0) & (dt <= MAX_INTERVAL) & (turn <= MAX_TURN * MAX_TURN)
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    if limit < MAX_INTERVAL:
-        within = within & (dt <= limit)
-
-    def divided() -> None:
-        m.comment("a rotation beyond the range of the polynomials: equal steps at the same rate, which compose exactly")
-        count = m.whole(m.root(turn) / LARGEST_ANGLE + (dt / limit if limit < MAX_INTERVAL else 0.0)) + 1.0
+    turn = turn_squared(delta, dt, (f.x[4], f.x[5], f.x[6]))
+    limit = f.program.model.limit
+    if not (dt > 0.0 and dt <= MAX_INTERVAL and turn <= MAX_TURN * MAX_TURN):
+        return BAD_INPUT
+    if turn <= SQUARED_RANGE and (limit >= MAX_INTERVAL or dt <= limit):
+        step(f, delta, dt)
+    else:
+        comment("a rotation beyond the range of the polynomials: equal steps at the same rate, which compose exactly")
+        count = whole(square_root(turn) / LARGEST_ANGLE + (dt / limit if limit < MAX_INTERVAL else 0.0)) + 1
         part = 1.0 / count
-        m.repeat(count, lambda: m.call("step", scale(part, delta), part * dt))
+        for _ in range(count):
+            step(f, scale(part, delta), part * dt)
+    return OK
 
-    m.branch(within, lambda: m.call("step", delta, dt), divided)
-    m.leave("OK")
 
-
-def step(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
+def step(f: Any, delta: Any, dt: Any) -> None:
     """Propagate over one step: delta is the rotation vector."""
-    k = m.kernels
-    if program.structure.chains:
-        m.unless(m.equal(f.dt[0], dt), lambda: m.call("prepare", dt))
-    m.comment("attitude, and covariance: Phi P Phi' + Q, exact at constant rate")
-    k.advance(f.x, f.P, delta, dt, program.model, f.coefficients, 0.0)
+    if len(f.program.structure.chains) > 0 and f.dt[0] != dt:
+        prepare(f, dt)
+    comment("attitude, and covariance: Phi P Phi' + Q, exact at constant rate")
+    f.kernels.advance(f.x, f.P, delta, dt, f.program.model, f.coefficients, 0.0)
 
 
-def prepare(m: Any, program: Program, f: SimpleNamespace, dt: Any) -> None:
+def prepare(f: Any, dt: Any) -> None:
     """Coefficients of the states that decay, for steps of dt."""
-    m.kernels.fill_coefficients(f.coefficients, dt, program.model)
+    f.kernels.fill_coefficients(f.coefficients, dt, f.program.model)
     f.dt[0] = dt
 
 
 # ----------------------------------------------------------------------------------------------------------------------------- update
 
 
-def update(
-    m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: int, value: Any, sigma: Any = 0
-) -> None:
+def update(f: Any, sensor: Sensor, value: Any, sigma: Any = 0) -> Any:
     """Update with a measurement of a sensor."""
-    k, s = m.kernels, sensor.shape
-    z, frame = measured_values(m, sensor, value)
-    measured = Measured(z, frame, sensor.noise or (sigma * sigma,), sensor.length, (0.0,) * 9)
-    m.comment("innovations and gains")
-    g = k.gains(s, f.x, f.P, None, measured, program.model.numbers, None, 0.0)
-    m.unless(g.valid, lambda: m.leave("NO_HEADING"))
-    degrees, nis = degrees_of_freedom(sensor.kind), g.nis
-    sound: Any = True
-    lost: Any = False
+    k, model = f.kernels, f.program.model
+    z, frame = value, sensor.frame
+    if sensor.kind == VECTOR:
+        if sensor.length != 1.0:
+            z = tuple(x / sensor.length for x in value)
+        usable = dot(z, z) <= MAX_VECTOR * MAX_VECTOR
+    else:
+        squared = sum((x * x for x in value[1:]), value[0] * value[0])
+        usable = squared >= SHORTEST_SQUARED and squared <= LONGEST_SQUARED
+    if not usable:
+        return BAD_INPUT
+    if sensor.kind != VECTOR:
+        norm, off = square_root(squared), squared - 1.0
+        as_it_is = sensor.kind != ATTITUDE and off > -UNIT and off < UNIT
+        z = tuple(x if as_it_is else x / norm for x in value)
+    if sensor.kind == ATTITUDE:
+        z, frame = sensor.variances, (*z, 0.0, 0.0, 0.0, 0.0, 0.0)
+    noise = sensor.noise if len(sensor.noise) > 0 else (sigma * sigma,)
+    measured = Measured(z, frame, noise, sensor.length, (0.0,) * 9)
+    comment("innovations and gains")
+    g = k.gains(sensor.shape, f.x, f.P, None, measured, model.numbers, None, 0.0)
+    if not g.valid:
+        return NO_HEADING
+    sound, lost = True, False
     for S, variance in zip(g.variances, g.noise, strict=True):
-        sound = sound & (S > 0.0)
-        lost = lost | (program.max_precision * variance < S)
-    m.unless(sound, lambda: m.leave("BAD_INPUT"))
-    f.nis[index] = nis
-    if program.thresholds is not None:
-        accepted = nis <= program.thresholds[degrees - 1]
+        sound = sound and S > 0.0
+        lost = lost or f.program.max_precision * variance < S
+    if not sound:
+        return BAD_INPUT
+    f.nis[f.program.sensors.index(sensor)] = g.nis
+    if f.program.thresholds is not None:
+        accepted = g.nis <= f.program.thresholds[degrees_of_freedom(sensor.kind) - 1]
         if sensor.kind == DIRECTION:
-            accepted = accepted & (g.angle[1] >= 0.0)
-        m.unless(accepted, lambda: m.leave("REJECTED"))
-    m.unless(m.no(lost), lambda: m.leave("TOO_PRECISE"))
+            accepted = accepted and g.angle[1] >= 0.0
+        if not accepted:
+            return REJECTED
+    if lost:
+        return TOO_PRECISE
+    correct(f, sensor, measured, g)
+    apply_step(f, f.work)
+    return OK
 
-    work = m.work()
 
-    def precisely() -> None:
-        m.comment("much more precise than the state: Joseph's form, row after row")
-        rows = m.scratch()
-        k.store_rows(s, f.x, rows, measured, program.model.numbers, False, 0.0)
+def correct(f: Any, sensor: Sensor, measured: Measured, g: Any) -> None:
+    """Update P, and write the correction to the work space."""
+    k, n, work = f.kernels, f.program.n, f.work
+    if g.precise:
+        comment("much more precise than the state: Joseph's form, row after row")
+        rows: dict[int, Any] = {}
+        k.store_rows(sensor.shape, f.x, rows, measured, f.program.model.numbers, False, 0.0)
         k.clear_step(work, 0.0)
         for i in range(ROWS_OF_KIND[sensor.kind]):
             line = k.LINE * (k.ROWS + i)
-            put_row(k, work, tuple(rows[line + j] for j in range(program.n)))
-            m.call("take_row", rows[line + k.RESIDUAL], rows[line + k.VARIANCE], "work")
-        m.call("apply_step", "work")
-        m.leave("OK")
-
-    m.branch(g.precise, precisely)
-    m.comment("correction, covariance, and its transformation to the tangent space of the corrected attitude")
-    for j in range(program.n):
-        for i, gain in enumerate(g.gain):
-            work[k.LINE * (k.GAINS + i) + j] = gain[j]
-        work[k.LINE * k.STEP + j] = k.products(g.steps, tuple(gain[j] for gain in g.gain))
-    for i in range(len(g.gain)):
-        m.call("subtract", k.LINE * (k.GAINS + i), "work")
-    m.call("apply_step", "work")
-    m.leave("OK")
+            for j in range(n):
+                work[k.LINE * k.ROWS + j] = rows[line + j]
+            take_row(f, rows[line + k.RESIDUAL], rows[line + k.VARIANCE], work)
+    else:
+        comment("correction, covariance, and its transformation to the tangent space of the corrected attitude")
+        for j in range(n):
+            for i, gain in enumerate(g.gain):
+                work[k.LINE * (k.GAINS + i) + j] = gain[j]
+            work[k.LINE * k.STEP + j] = k.products(g.steps, tuple(gain[j] for gain in g.gain))
+        for i in range(len(g.gain)):
+            subtract(f, k.LINE * (k.GAINS + i), work)
 
 
-def measured_values(m: Any, sensor: Sensor, value: Any) -> tuple[Any, Any]:
-    """Return a measurement and its frame as the kernels take them, after a check."""
-    if sensor.kind == VECTOR:
-        z = tuple(x / sensor.length for x in value) if sensor.length != 1.0 else value
-        m.unless(dot(z, z) <= MAX_VECTOR * MAX_VECTOR, lambda: m.leave("BAD_INPUT"))
-        return z, sensor.frame
-    squared = sum((x * x for x in value[1:]), value[0] * value[0])
-    m.unless((squared >= SHORTEST_SQUARED) & (squared <= LONGEST_SQUARED), lambda: m.leave("BAD_INPUT"))
-    norm = m.root(squared)
-    if sensor.kind == ATTITUDE:
-        return sensor.variances, (*(x / norm for x in value), 0.0, 0.0, 0.0, 0.0, 0.0)
-    off = squared - 1.0
-    as_it_is = (off > -UNIT) & (off < UNIT)
-    return tuple(m.select(as_it_is, x, x / norm) for x in value), sensor.frame
-
-
-def put_row(k: Any, work: Any, row: Any) -> None:
-    """Write a row h to the work space."""
-    for j, h in enumerate(row):
-        work[k.LINE * k.ROWS + j] = h
-
-
-def take_row(m: Any, program: Program, f: SimpleNamespace, residual: Any, variance: Any, work: Any) -> None:
+def take_row(f: Any, residual: Any, variance: Any, work: Any) -> None:
     """Update P and the correction with the row in the work space, in Joseph's form."""
-    k = m.kernels
-    k.take_row(f.P, work, k.ROWS, residual, variance, 0.0)
+    f.kernels.take_row(f.P, work, f.kernels.ROWS, residual, variance, 0.0)
 
 
-def subtract(m: Any, program: Program, f: SimpleNamespace, line: Any, work: Any) -> None:
+def subtract(f: Any, line: Any, work: Any) -> None:
     """Subtract the outer product of a line of the work space from P."""
-    m.kernels.minus_outer_by_elements(f.P, work, line, line, 1.0, 0.0)
+    f.kernels.minus_outer_by_elements(f.P, work, line, line, 1.0, 0.0)
 
 
-def apply_step(m: Any, program: Program, f: SimpleNamespace, work: Any) -> None:
+def apply_step(f: Any, work: Any) -> None:
     """Correct the state, and transform P to the tangent space of the corrected attitude."""
-    m.kernels.apply_step(f.x, f.P, work, 0.0)
+    f.kernels.apply_step(f.x, f.P, work, 0.0)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------ start
 
 
-def init(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> None:
+def init(f: Any, attitude: Any) -> Any:
     """Start at an attitude, with the sigma of the setup and zero bias."""
     squared = sum((x * x for x in attitude[1:]), attitude[0] * attitude[0])
-    usable = (squared >= SHORTEST_SQUARED) & (squared <= LONGEST_SQUARED)
-    norm = m.root(squared)
-    for i, x in enumerate(attitude):
-        f.x[i] = m.select(usable, x / norm, 1.0 if i == 0 else 0.0)
-    clear(m, program, f)
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    m.leave("OK")
+    usable = squared >= SHORTEST_SQUARED and squared <= LONGEST_SQUARED
+    norm = square_root(squared)
+    for i in range(4):
+        f.x[i] = attitude[i] / norm if usable else (1.0 if i == 0 else 0.0)
+    clear(f)
+    if not usable:
+        return BAD_INPUT
+    return OK
 
 
-def clear(m: Any, program: Program, f: SimpleNamespace) -> None:
+def clear(f: Any) -> None:
     """Set all but the attitude to the start."""
-    for i in range(4, program.n + 1):
+    n = f.program.n
+    for i in range(4, n + 1):
         f.x[i] = 0.0
-    for i in range(program.n):
-        for j in range(i, program.n):
-            f.P[place(program.n, i, j)] = program.covariance[i][j]
-    for i in range(len(program.sensors)):
+    for i in range(n):
+        for j in range(i, n):
+            f.P[place(n, i, j)] = f.program.covariance[i][j]
+    for i in range(len(f.program.sensors)):
         f.nis[i] = 0.0
-    if program.structure.chains:
+    if len(f.program.structure.chains) > 0:
         f.dt[0] = 0.0
-    m.clear_status()
+    f.status[0] = 0

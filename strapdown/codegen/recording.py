@@ -1,14 +1,13 @@
 """The filter of :class:`strapdown.ahrs.LiveAhrs` sample by sample, as it runs on the target, with checks and flags.
 
-Its steps are the functions of :mod:`strapdown.kernels.live_imu`, executed on arrays of the target. As in :mod:`strapdown.codegen.program`,
-every function here asks a machine ``m`` for what depends on it; ``m.kernel`` executes a kernel.
+Its steps are the functions of :mod:`strapdown.kernels.live_imu`, executed on arrays of the target; those in ``REPLACED`` are defined here.
+As in :mod:`strapdown.codegen.program`, all are plain functions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,21 +116,25 @@ class View:
         return self.read(*place)
 
 
-def imu_of(m: Any) -> Imu:
-    """Return the filter of an IMU with the arrays of a machine instead of those of Python."""
-    program, f = m.program, m.state
-    r, imu = program.recording, program.recording.imu
-    *carried, _ = imu.routines.carry.arguments[3]
-    passing = {name: array for name, array in imu.arrays._asdict().items() if name in live_imu.PASSING}
+def imu_of(f: Any, local: Callable[..., Any], passing: Callable[..., Any]) -> Imu:
+    """Return the filter of an IMU with the arrays of the filter ``f`` on the target instead of those of Python.
+
+    ``local`` returns an array by name and shape that lasts for a step; ``passing`` one like one of Python that lasts for a function.
+    """
+    n, r, imu = f.program.n, f.program.recording, f.program.recording.imu
+    carried = imu.routines.carry.arguments[3]
+    arrays = imu.arrays._asdict()
     own = {_key(array): getattr(f, name) for name, array in r.lasting.items()}
-    own |= {_key(passing[name]): m.local(name, passing[name].shape) for name in LOCAL}
-    for array in (*passing.values(), *carried, imu.time, imu.gyro, imu.accelerometer, imu.magnetic):
-        own.setdefault(_key(array), m.passing(array))
+    own |= {_key(arrays[name]): local(name, arrays[name].shape) for name in LOCAL}
     own[_key(imu.attitude)] = View(lambda _, i: f.x[i])
     own[_key(imu.bias)] = View(lambda _, i: f.x[4 + i])
-    own[_key(imu.variance)] = View(lambda _, i: f.P[body.place(program.n, i, i)])
-    own[_key(imu.covariance)] = [View(lambda i, j: f.P[body.place(program.n, min(i, j), max(i, j))])]
-    own[_key(imu.routines.carry.arguments[3].covariance)] = ()
+    own[_key(imu.variance)] = View(lambda _, i: f.P[body.place(n, i, i)])
+    own[_key(imu.covariance)] = [View(lambda i, j: f.P[body.place(n, min(i, j), max(i, j))])]
+    own[_key(carried.covariance)] = ()
+    written = (arrays[name] for name in live_imu.PASSING)
+    for array in (*written, *carried, imu.time, imu.gyro, imu.accelerometer, imu.magnetic):
+        if _key(array) not in own:
+            own[_key(array)] = passing(array)
 
     def here(value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -146,7 +149,7 @@ def imu_of(m: Any) -> Imu:
         for kernel, routine in zip(live_imu.KERNELS, imu.routines, strict=True)
     )
     unused = dict.fromkeys(("filter", "state", "numbers", "places", "refused", "routines"))
-    return here(imu._replace(**unused))._replace(routines=live_imu.Routines(*routines))  # type: ignore[no-any-return]
+    return here(imu._replace(**unused))._replace(filter=f, routines=live_imu.Routines(*routines))  # type: ignore[no-any-return]
 
 
 def _key(array: np.ndarray) -> tuple[Any, ...]:
@@ -154,35 +157,17 @@ def _key(array: np.ndarray) -> tuple[Any, ...]:
     return (array.ctypes.data, array.shape)
 
 
-def helpers(m: Any) -> dict[str, Any]:
-    """Return what the functions of :mod:`strapdown.kernels.live_imu` call on the target: by name."""
-    program, f = m.program, m.state
-
-    def update_filter(imu: Any, sensor: int, vector: Any, sigma: Any) -> Any:
-        declared = program.sensors[sensor]
-        status = m.call(
-            f"update_{declared.name}", row(vector), sigma / declared.length, result="status" if sensor else None
-        )
-        return m.select(m.equal(status, 0), f.nis[sensor], 0.0) if sensor else 0.0
-
-    called = "end_step", "carry_to_sample", "find_rest", "clear_span"
-    return {
-        "call": lambda kernel, arguments, like: m.kernel(kernel, *arguments),
-        "predict_filter": lambda imu, turn: m.call("propagate", row(turn), f.clock[0] - f.clock[1]),
-        "update_filter": update_filter,
-        "show_filter": lambda imu: None,
-        **{name: lambda *_, name=name: m.call(name) for name in called},
-    }
+# ------------------------------------------------------------------------------------------------------------------ start and samples
 
 
-def init(m: Any, program: Any, f: SimpleNamespace) -> None:
+def init(f: Any) -> Any:
     """Wait for the first sample."""
-    r = program.recording
+    r = f.program.recording
     for i in range(4):
         f.x[i] = f.q[i] = 1.0 if i == 0 else 0.0
-    body.clear(m, program, f)
+    body.clear(f)
     for i in range(6):
-        f.variance[i] = program.covariance[i][i]
+        f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
     if r.magnetometer:
         for array in (f.counted, f.sums, f.iron, f.total, f.start):
@@ -191,122 +176,137 @@ def init(m: Any, program: Any, f: SimpleNamespace) -> None:
         level, weight = regions.FIRST_LEVEL
         f.field_level[0], f.field_sums[0], f.field_sums[1] = level, level * weight, weight
     if r.imu.rests:
-        m.call("clear_span")
+        rests.clear_span(f)
         f.resting[1] = 0
         f.rest_variance[1] = r.parameters.bias_sigma**2
-    m.leave("OK")
+    return body.OK
 
 
-def update(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, force: Any, field: Any = None) -> None:
+def update(f: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any = None) -> Any:
     """Take a sample.
 
     time: s, rising. gyro: rad/s, body axes. accelerometer: specific force, m/s^2, body axes; zero or null: missing. magnetometer: field,
     any unit, body axes; zero or null: missing.
     """
-    r, imu = program.recording, m.imu
-    usable = (time >= -1e15) & (time <= 1e15)
+    imu = f.imu
+    vectors = (accelerometer, magnetometer) if imu.magnetometer else (accelerometer,)
+    usable = time >= -1e15 and time <= 1e15
     for x in gyro:
-        usable = usable & (abs(x) <= imu.largest_rate)
-    vectors = (force, field) if r.magnetometer else (force,)
+        usable = usable and abs(x) <= imu.largest_rate
     for vector in vectors:
         square = dot(vector, vector)
-        usable = usable & ((square >= body.SHORTEST_SQUARED) | m.equal(square, 0.0)) & (square <= body.LONGEST_SQUARED)
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    imu.time[0] = time
-    for array, vector in zip((imu.gyro, imu.accelerometer, imu.magnetic), (gyro, *vectors), strict=False):
-        for i in range(3):
-            array[0, i] = vector[i]
-    m.branch(m.equal(f.count[0], 0), lambda: begin(m, program, f, time, gyro, vectors))
+        usable = usable and (square >= body.SHORTEST_SQUARED or square == 0.0) and square <= body.LONGEST_SQUARED
+    if not usable:
+        return body.BAD_INPUT
+    if f.count[0] == 0:
+        return begin(f, time, gyro, accelerometer, magnetometer)
     dt = time - f.clock[0]
-    usable = (dt > 0.0) & (dt <= body.MAX_INTERVAL) & (f.count[1] + 1 < len(f.force))
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    m.kernel(live_imu.take_sample, imu)
-    m.leave("OK")
+    if not (dt > 0.0 and dt <= body.MAX_INTERVAL and f.count[1] + 1 < len(f.force)):
+        return body.BAD_INPUT
+    put_sample(imu, time, gyro, accelerometer, magnetometer)
+    live_imu.take_sample(imu)
+    return body.OK
 
 
-def end_step(m: Any, program: Any, f: SimpleNamespace) -> None:
+def put_sample(imu: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any) -> None:
+    """Write a sample where the functions of the IMU read it."""
+    imu.time[0] = time
+    for i in range(3):
+        imu.gyro[0, i] = gyro[i]
+        imu.accelerometer[0, i] = accelerometer[i]
+        if imu.magnetometer:
+            imu.magnetic[0, i] = magnetometer[i]
+
+
+def begin(f: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any) -> Any:
+    """Start at a sample with a specific force and, with a magnetometer, a field: as strapdown.ahrs.starting.start."""
+    imu, parameters = f.imu, f.program.recording.parameters
+    if not dot(accelerometer, accelerometer) > 0.0:
+        return body.NOT_STARTED
+    sine, heading, iron, across = 0.0, 0.0, 0.0, magnetometer
+    constants = starting.start_constants(parameters)
+    tilt = first_state.tilt_variance(constants, accelerometer, gyro)
+    if imu.magnetometer:
+        if not dot(magnetometer, magnetometer) > 0.0:
+            return body.NOT_STARTED
+        sine = first_state.sine_of_dip(accelerometer, magnetometer)
+        if not 1.0 - sine * sine > MIN_HORIZONTAL_SQUARED:
+            return body.NO_HEADING
+        heading = first_state.heading_variance(constants, sine, tilt)
+        iron = first_state.iron_variance(parameters.iron_sigma, sine)
+    else:
+        across = first_state.least_axis(accelerometer)
+    q, up = first_state.first_attitude(accelerometer, across), first_state.direction(accelerometer)
+    for i in range(4):
+        f.x[i] = q[i]
+    for i in range(3):
+        for j in range(i, 3):
+            f.P[body.place(f.program.n, i, j)] = up[i] * up[j] * heading + (tilt if i == j else 0.0)
+    f.iron_variance[0] = iron
+    if imu.rests:
+        f.rest_clock[1] = time
+    put_sample(imu, time, gyro, accelerometer, magnetometer)
+    live_imu.start(imu)
+    return body.OK
+
+
+# ------------------------------------------------------------------------------------- in place of functions of the filter in Python
+
+
+def predict_filter(imu: Any, turn: Any) -> None:
+    """Propagate the filter over the rotation of a step."""
+    f = imu.filter
+    body.propagate(f, (turn[0, 0], turn[0, 1], turn[0, 2]), f.clock[0] - f.clock[1])
+
+
+def update_filter(imu: Any, index: int, vector: Any, sigma: Any) -> Any:
+    """Update the filter with a vector of a sensor; return its NIS, 0 if it was not used."""
+    f = imu.filter
+    sensor = f.program.sensors[index]
+    status = body.update(f, sensor, (vector[0, 0], vector[0, 1], vector[0, 2]), sigma / sensor.length)
+    return f.nis[index] if status == body.OK else 0.0
+
+
+def show_filter(imu: Any) -> None:
+    """Leave the state where it is read."""
+
+
+def end_step(imu: Any) -> None:
     """Filter a step: its rotation, the mean of its samples, and a heading that ends with it."""
-    if program.recording.imu.rests:
-        m.branch(m.equal(f.resting[1], 2), lambda: m.call("use_rest"))
-    if program.recording.magnetometer:
+    if imu.rests > 0 and imu.resting[1] == 2:
+        use_rest(imu.filter)
+    if imu.magnetometer > 0:
         for i in range(3):
-            m.imu.arrays.found_direction[0, i] = 0.0
-    m.kernel(live_imu.end_step, m.imu)
+            imu.arrays.found_direction[0, i] = 0.0
+    live_imu.end_step(imu)
 
 
-def carry_to_sample(m: Any, program: Any, f: SimpleNamespace) -> None:
+def carry_to_sample(imu: Any) -> None:
     """Propagate the estimate to the last sample."""
-    m.kernel(live_imu.carry_to_sample, m.imu)
-    carried = m.imu.routines.carry.arguments[3]
+    live_imu.carry_to_sample(imu)
+    f, carried = imu.filter, imu.routines.carry.arguments[3]
     for i in range(4):
         f.q[i] = carried.attitude[1, i]
     for i in range(6):
         f.variance[i] = carried.variance[1, i]
 
 
-def row(array: Any) -> Any:
-    """Return the first row of an array (1, 3)."""
-    return tuple(array[0, i] for i in range(3))
+REPLACED: dict[str, Any] = {
+    function.__name__: function for function in (predict_filter, update_filter, show_filter, end_step, carry_to_sample)
+}
 
 
-# ------------------------------------------------------------------------------------------------------------------------------ start
-
-
-def begin(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, vectors: Any) -> None:
-    """Start at a sample with a specific force and, with a magnetometer, a field: :func:`strapdown.ahrs.starting.start`."""
-    r, force = program.recording, vectors[0]
-    present: Any = True
-    for vector in vectors:
-        present = present & (dot(vector, vector) > 0.0)
-    m.unless(present, lambda: m.leave("NOT_STARTED"))
-    constants, sine = starting.start_constants(r.parameters), 0.0
-    if r.magnetometer:
-        sine = m.kernel(first_state.sine_of_dip, *vectors)
-        m.unless(1.0 - sine * sine > MIN_HORIZONTAL_SQUARED, lambda: m.leave("NO_HEADING"))
-    up, across = m.kernel(first_state.direction, force), vectors[-1]
-    if not r.magnetometer:
-        across = m.kernel(first_state.least_axis, force)
-    q = m.kernel(first_state.first_attitude, force, across)
-    tilt = m.kernel(first_state.tilt_variance, constants, force, gyro)
-    heading = m.kernel(first_state.heading_variance, constants, sine, tilt) if r.magnetometer else 0.0
-    iron = m.kernel(first_state.iron_variance, r.parameters.iron_sigma, sine) if r.magnetometer else 0.0
-    for i in range(4):
-        f.x[i] = q[i]
-    for i in range(3):
-        for j in range(i, 3):
-            f.P[body.place(program.n, i, j)] = up[i] * up[j] * heading + (tilt if i == j else 0.0)
-    f.iron_variance[0] = iron
-    if r.imu.rests:
-        f.rest_clock[1] = time
-    m.kernel(live_imu.start, m.imu)
-    m.leave("OK")
-
-
-# -------------------------------------------------------------------------------------------------------------------------------- rest
-
-
-def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Decide at the end of a span whether it was a rest."""
-    constants, *_, memory, _ = m.imu.routines.watch.arguments
-    m.kernel(rests.find_rest, constants, f.clock[0], memory)
-
-
-def clear_span(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Begin another span in which rest is looked for."""
-    m.kernel(rests.clear_span, f)
-
-
-def use_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
+def use_rest(f: Any) -> None:
     """Correct the state by a rate at rest."""
-    k, n = m.kernels, program.n
-    work = m.work()
+    k, n, work = f.kernels, f.program.n, f.work
     k.clear_step(work, 0.0)
     for i in range(3):
-        body.put_row(k, work, tuple(1.0 if j == 3 + i else 0.0 for j in range(n)))
-        m.call("take_row", f.rest_rate[0, i] - f.x[4 + i], f.rest_variance[0], "work")
-    change = [work[k.LINE * k.STEP + i] for i in range(n)]
-    both = k.turned_by(tuple(f.x[i] for i in range(4)), tuple(change[:3]))
-    q, J = m.kernel(unit, both[:4]), both[4:]
+        for j in range(n):
+            work[k.LINE * k.ROWS + j] = 1.0 if j == 3 + i else 0.0
+        body.take_row(f, f.rest_rate[0, i] - f.x[4 + i], f.rest_variance[0], work)
+    change = tuple(work[k.LINE * k.STEP + i] for i in range(n))
+    both = k.turned_by(tuple(f.x[i] for i in range(4)), change[:3])
+    q, J = unit(both[:4]), both[4:]
     for i in range(n + 1):
         f.x[i] = q[i] if i < 4 else f.x[i] + change[i - 1]
     P = {(i, j): f.P[body.place(n, i, j)] for i in range(3) for j in range(i, n)}
@@ -316,8 +316,8 @@ def use_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
     ]
     for i in range(3):
         for j in range(i, n):
-            turned = (
-                sum((half[i][c] * J[3 * j + c] for c in range(1, 3)), half[i][0] * J[3 * j]) if j < 3 else half[i][j]
-            )
+            turned = half[i][j]
+            if j < 3:
+                turned = sum((half[i][c] * J[3 * j + c] for c in range(1, 3)), half[i][0] * J[3 * j])
             f.P[body.place(n, i, j)] = turned
     f.resting[1] = 0

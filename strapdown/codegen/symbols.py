@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-KERNELS = "strapdown.kernels"
 PINNED = ("load", "at", "result", "parameter")
 """Kinds of symbols that stay in the block in which they were made."""
 CONDITIONS = ("<", ">", "<=", ">=", "==", "&&", "||", "not")

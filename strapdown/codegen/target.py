@@ -2,119 +2,104 @@
 
 from __future__ import annotations
 
+import ast
 import functools
-from collections.abc import Callable, Sequence
-from types import ModuleType, SimpleNamespace
+from collections.abc import Callable, Mapping
+from types import FunctionType, SimpleNamespace
 from typing import Any
-
-import numpy as np
 
 from strapdown.codegen import program as body
 from strapdown.codegen import recording
-from strapdown.codegen.functions import Function, Local, Member, Statement
-from strapdown.codegen.interpreted import Interpreter
+from strapdown.codegen.functions import Function, Local, Member
+from strapdown.codegen.interpreted import Interpreter, Module, parsed
 from strapdown.codegen.program import Program, work_size
-from strapdown.codegen.symbols import Symbol, Values
+from strapdown.codegen.symbols import Symbol
+from strapdown.kernels import headings, rests
 
-
-class Kernels:
-    """Kernels of a module, executed on symbols."""
-
-    def __init__(self, module: ModuleType, execute: Callable[..., Any]) -> None:
-        self.module, self.execute = module, execute
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self.module, name)
-        return functools.partial(self.execute, value) if callable(value) else value
+OWN: set[Any] = {
+    *(
+        body.far_turn,
+        body.prepare,
+        body.step,
+        body.propagate,
+        body.take_row,
+        body.subtract,
+        body.apply_step,
+        body.update,
+    ),
+    *(recording.begin, recording.carry_to_sample, recording.end_step, recording.use_rest),
+    *(headings.look, headings.insert, headings.iron_step, rests.find_rest, rests.clear_span),
+}
+"""Functions that are functions of the target: called at several places, long, or with an early return."""
 
 
 class Target(Function):
-    """A function of the filter while it is traced, as a machine for :mod:`strapdown.codegen.program`."""
+    """A function of the filter while it is traced."""
 
-    def __init__(
-        self,
-        program: Program,
-        name: str,
-        parameters: Sequence[tuple[str, Any]],
-        *,
-        returns: str,
-        words: str,
-        functions: dict[str, Any] | None = None,
-    ) -> None:
-        super().__init__(name, parameters, returns=returns)
-        self.words, self.n, self.program = words, program.n, program
-        self.functions: dict[str, Any] = {} if functions is None else functions
-        """Kernels that are functions of the target, and the number of their results."""
-        trace = self.trace
+    def __init__(self, program: Program, name: str, parameters: Mapping[str, Any], functions: dict[str, Any]) -> None:
+        super().__init__(name, list(parameters.items()))
+        self.words, self.program, self.functions = "", program, functions
+        """Functions of the target by name, and the number of their results, if there are several."""
         helpers: dict[str, Any] = {
             "far_turn": self._far_turn,
             "load": load,
             "broadcast": broadcast,
             "sum_lanes": sum_lanes,
+            "comment": self.comment,
+            "whole": lambda x: self.trace.symbol("floor", x),
         }
-        self.kernel, self.spaces = Interpreter(self, helpers), {}
-        self.kernels = Kernels(program.kernels, self.kernel.unrolled)
-        self.select, self.root = trace.select, trace.square_root
-        self.state = SimpleNamespace(
+        helpers["call"] = lambda kernel, arguments, like: self.kernel(kernel, *arguments)
+        self.kernel: Interpreter = Interpreter(self, helpers, OWN, recording.REPLACED)
+        self.state = f = SimpleNamespace(
+            program=program,
+            kernels=Module(program.kernels, self.kernel.unrolled),
             x=self.array(name_of_state),
             P=Member(self, "f->P", (program.number_of_covariances,)),
             nis=self.array(lambda i: f"f->nis[{i}]"),
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
             dt=self.array(lambda i: "f->step_dt"),
+            status=self.array(lambda i: "f->status"),
+            work=Local(self, "work", (work_size(program.kernels),)),
         )
-        self.imu: Any = None
         if program.recording is not None:
             for a in program.recording.arrays:
-                setattr(self.state, a.name, Member(self, f"f->{a.name}", a.shape, a.kind))
-            self.imu = recording.imu_of(self)
-            self.kernel.helpers |= recording.helpers(self)
-            self.spaces = {"memory": self.state, "constants": self.imu.routines.head.arguments[0]}
+                setattr(f, a.name, Member(self, f"f->{a.name}", a.shape, a.kind))
+            local, passing = functools.partial(Local, self), (lambda array: Member(self, "", array.shape))
+            f.imu = recording.imu_of(f, local, passing)
 
-    def another(self, name: str, parameters: Sequence[tuple[str, Any]], words: str) -> Target:
-        """Return another function of the filter, not yet traced."""
-        return Target(self.program, name, parameters, returns="", words=words, functions=self.functions)
+    def name_of(self, function: FunctionType, known: Mapping[str, Any]) -> str:
+        """Return the name of a function of the target."""
+        return f"update_{known['sensor'].name}" if "sensor" in known else function.__name__
 
-    def local(self, name: str, shape: tuple[int, ...]) -> Member:
-        """Return a local array with rows, declared if it is used."""
-        return Local(self, name, shape)
+    def define(self, function: Any, name: str, sizes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+        """Trace a function of the target: with parameters, what is known of the others, and the filter's state."""
+        m = Target(self.program, name, sizes, self.functions)
+        m.words = known["sensor"].words if "sensor" in known else " ".join((function.__doc__ or "").split())
+        tree = parsed(function)
+        if function.__module__.startswith(__package__) and any(isinstance(x, ast.Return) for x in ast.walk(tree)):
+            m.returns = "status"
+        own = {"f": m.state, "memory": m.state}
+        if self.program.recording is not None:
+            of_rests = function.__module__ == rests.__name__
+            own["imu"] = m.state.imu
+            own["constants"] = (m.state.imu.routines.watch if of_rests else m.state.imu.routines.head).arguments[0]
+        arguments = [m.argument(x.arg) if x.arg in sizes else {**known, **own}[x.arg] for x in tree.args.args]
+        size = m.kernel.trace_function(function, arguments)
+        self.functions[name] = m, size
 
-    def passing(self, like: np.ndarray) -> Member:
-        """Return an array as one of Python, which exists while tracing."""
-        return Member(self, "", like.shape)
-
-    def lowest(self, x: Any) -> Any:
-        """Return x rounded down, however large."""
-        return self.trace.symbol("lowest", x)
+    def give(self, value: Any) -> None:
+        """Return a number, nothing, or a status."""
+        if self.returns == "status" and not isinstance(value, Symbol):
+            self.leave(next(name for name, (bit, _) in self.program.statuses.items() if bit == value))
+        else:
+            super().give(value)
 
     def _far_turn(self, phi: Any) -> tuple[Any, Any]:
+        if "far_turn" not in self.functions:
+            self.define(body.far_turn, "far_turn", {"x": 0, "y": 0, "z": 0, "turn": -13}, {})
         values = self.trace.symbol("tuple", "far_turn", 13, *phi)
         items = tuple(self.trace.symbol("item", values, i) for i in range(13))
         return items[:4], items[4:]
-
-    def whole(self, x: Any) -> Any:
-        """Return x rounded down."""
-        return self.trace.symbol("floor", x)
-
-    def equal(self, a: Any, b: Any) -> Any:
-        """Return whether two numbers are equal."""
-        return self.trace.symbol("==", a, b)
-
-    def no(self, condition: Any) -> Any:
-        """Return whether a condition does not hold."""
-        return self.trace.symbol("not", condition) if isinstance(condition, Symbol) else not condition
-
-    def scratch(self) -> Values:
-        """Return numbers that exist while tracing."""
-        return self.array()
-
-    def work(self) -> Member:
-        """Return work space."""
-        return self.local("work", (work_size(self.kernels),))
-
-    def clear_status(self) -> None:
-        """Clear the flags."""
-        self.flush()
-        self.add(Statement("clear"))
 
 
 def name_of_state(i: int) -> str:
@@ -163,49 +148,18 @@ class Eight(list[Any]):
 
 def traced(program: Program) -> list[Target]:
     """Return the functions of the filter, in an order in which each calls only those before it."""
-    kernels: dict[str, Any] = {}
-
-    def function(
-        formula: Callable[..., None],
-        *parameters: tuple[str, Any],
-        returns: str = "",
-        more: tuple[Any, ...] = (),
-        name: str = "",
-        words: str = "",
-    ) -> Target:
-        words = words or " ".join((formula.__doc__ or "").split())
-        m = Target(program, name or formula.__name__, parameters, returns=returns, words=words, functions=kernels)
-        formula(m, program, m.state, *more, *(m.argument(parameter) for parameter, _ in parameters))
-        m.flush()
-        return m
-
-    r, work = program.recording, ("work", -work_size(program.kernels))
-    coefficients = [function(body.prepare, ("dt", 0))] if program.structure.chains else []
-    functions = [
-        function(body.far_turn, ("x", 0), ("y", 0), ("z", 0), ("turn", -13)),
-        *coefficients,
-        function(body.step, ("delta", 3), ("dt", 0)),
-        function(body.take_row, ("residual", 0), ("variance", 0), work),
-        function(body.subtract, ("line", "int"), work),
-        function(body.apply_step, work),
-    ]
+    r = program.recording
+    m = Target(program, "", {}, {})
     if r is None:
-        functions.append(function(body.init, ("attitude", 4), returns="status"))
-        functions.append(function(body.predict, ("gyro", 3), ("dt", 0), returns="status"))
+        m.define(body.init, "init", {"attitude": 4}, {})
+        m.define(body.predict, "predict", {"gyro": 3, "dt": 0}, {})
+        for sensor in program.sensors:
+            m.define(body.update, f"update_{sensor.name}", {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
     else:
-        functions.append(function(body.propagate, ("delta", 3), ("dt", 0), returns="status"))
-    for index, sensor in enumerate(program.sensors):
-        values = [("value", sensor.size), *([] if r is None else [("sigma", 0)])]
-        named: dict[str, Any] = {"name": f"update_{sensor.name}", "words": sensor.words, "more": (sensor, index)}
-        functions.append(function(body.update, *values, returns="status", **named))
-    if r is None:
-        return functions
-    at_rest = recording.find_rest, recording.clear_span, recording.use_rest
-    last = [*map(function, at_rest)] if r.imu.rests else []
-    last += [function(recording.carry_to_sample), function(recording.end_step)]
-    last.append(function(recording.init, returns="status"))
-    sample = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)][: 3 + r.magnetometer]
-    words = " ".join((recording.update.__doc__ or "").split())
-    words = words if r.magnetometer else words.partition(" magnetometer:")[0]
-    last.append(function(recording.update, *sample, returns="status", words=words))
-    return functions + [target for target, _ in kernels.values()] + last
+        m.define(recording.init, "init", {}, {})
+        sample = {"time": "wide", "gyro": 3, "accelerometer": 3} | ({"magnetometer": 3} if r.magnetometer else {})
+        m.define(recording.update, "update", sample, {"magnetometer": None})
+    functions = [target for target, _ in m.functions.values()]
+    if r is not None and not r.magnetometer:
+        functions[-1].words = functions[-1].words.partition(" magnetometer:")[0]
+    return functions

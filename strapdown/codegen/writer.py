@@ -81,9 +81,6 @@ class Writer:
         loads = [x for x in alive if x.kind in kinds and x.number < statement.number and places[x] is slot]
         return self.placement.needed(loads, slot, self.written)
 
-    def _clear(self, statement: Statement) -> None:
-        self.line(f"{self._member('f->status')} = 0;")
-
     def _comment(self, statement: Statement) -> None:
         self.line(f"/* {statement.text} */")
 
@@ -114,10 +111,6 @@ class Writer:
             self._block(block)
             self.indent -= 1
         self.line("}")
-
-    def _repeat(self, statement: Statement) -> None:
-        count = self.text(statement.values[0])
-        self._repeated(f"for ({self.language.variable['int']} i = 0; i < {count}; i++) {{", statement)
 
     def _for(self, statement: Statement) -> None:
         name, (start, stop) = statement.text, (self.text(x, "int") for x in statement.values)
