@@ -36,7 +36,7 @@ def language(*, single: bool) -> Language:
         numbers=lambda texts: f"(const strapdown_real[]){{{', '.join(texts)}}}",
         array=lambda name, size: f"strapdown_real {name}[{size}];",
         status=lambda name: f"STRAPDOWN_{name}",
-        whole=lambda text: f"(strapdown_real)(int)({text})",
+        truncated=lambda text: f"(int)({text})",
         real=lambda text: f"(strapdown_real){text}",
         quotient=lambda text: text,
     )

@@ -131,6 +131,7 @@ def mathematics(trace: Trace) -> dict[str, Any]:
     space = SimpleNamespace(
         **functions,
         floor=function("floor", "lowest"),
+        trunc=function("trunc"),
         copysign=lambda a, b: trace.select(b < 0.0, -abs(a), abs(a)),
         inf=math.inf,
         nan=math.nan,
@@ -442,7 +443,7 @@ class Interpreter:
             sizes = {
                 n: len(x) if type(x) is tuple else -len(x) if n == "work" else m.type_of(x) for n, x in passed.items()
             }
-            m.define(function, name, sizes, known)
+            m.define(function, sizes, known)
         target, size = m.functions[name]
         if not size:
             result = {"": None, "real": ""}.get(target.returns, target.returns)

@@ -16,7 +16,7 @@ LANGUAGE = Language(
     numbers=lambda texts: f"[{', '.join(texts)}]",
     array=lambda name, size: f"const {name} = new Float64Array({size});",
     status=lambda name: f"STATUS.{name}",
-    whole=lambda text: f"Math.floor({text})",
+    truncated=lambda text: f"Math.trunc({text})",
     real=lambda text: text,
     quotient=lambda text: f"Math.floor({text})",
 )

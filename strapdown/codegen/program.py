@@ -6,6 +6,7 @@ These are plain functions of a filter ``f``: arrays of its state, and what is kn
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -147,11 +148,6 @@ def comment(text: str) -> None:
     """Write a comment on the target."""
 
 
-def whole(x: Any) -> Any:
-    """Return x rounded down."""
-    return int(x)
-
-
 # ------------------------------------------------------------------------------------------------------------------------- prediction
 
 
@@ -170,7 +166,7 @@ def propagate(f: Any, delta: Any, dt: Any) -> Any:
         step(f, delta, dt)
     else:
         comment("a rotation beyond the range of the polynomials: equal steps at the same rate, which compose exactly")
-        count = whole(square_root(turn) / LARGEST_ANGLE + (dt / limit if limit < MAX_INTERVAL else 0.0)) + 1
+        count = math.trunc(square_root(turn) / LARGEST_ANGLE + (dt / limit if limit < MAX_INTERVAL else 0.0)) + 1
         part = 1.0 / count
         for _ in range(count):
             step(f, scale(part, delta), part * dt)

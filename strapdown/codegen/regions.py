@@ -79,6 +79,9 @@ class Placement:
             if sum(sizes.get(arm, 0) for arm in group.arms) < WORTH_A_BRANCH:
                 del self.groups[symbol]
         self._place(function.body, keep=True)
+        branches = ((x, slot) for block, slot in self.blocks.items() for x in block.statements if x.kind == "if")
+        self.conditions = [x.values[0] for x, slot in branches if self.places.get(x.values[0]) is slot]
+        """Conditions of statements ``if`` that are computed in the block of the statement."""
 
     def _add_blocks(self, block: Block, parent: Slot | None) -> None:
         slot = self.blocks[block] = Slot(parent, 0 if parent is None else parent.depth + 1)
@@ -92,9 +95,10 @@ class Placement:
         waiting: list[Symbol] = []
         for block in blocks_of(body):
             for statement in block.statements:
-                waiting.extend(symbols_of(statement.values))
-        for symbol in waiting:
-            self.uses[symbol] = self.uses.get(symbol, 0) + 2  # a root is never written into an expression
+                for symbol in symbols_of(statement.values):
+                    # The condition of an `if` may be written into it, as an operand into an operation; no other root is.
+                    self.uses[symbol] = self.uses.get(symbol, 0) + (1 if statement.kind == "if" else 2)
+                    waiting.append(symbol)
         known = set()
         while waiting:
             symbol = waiting.pop()

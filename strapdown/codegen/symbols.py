@@ -97,7 +97,7 @@ class Symbol:
 def type_of(kind: str, operands: tuple[Any, ...]) -> str:
     """Return the type of an operation's result. The difference of two times as they are stored is a duration, of the usual type."""
     symbols = [x for x in operands if isinstance(x, Symbol)]
-    if kind in CONDITIONS:
+    if kind in (*CONDITIONS, "trunc"):
         return "int"
     if any(x.type == "wide" for x in symbols) and kind not in PINNED:
         stored = len(symbols) == 2 and all(x.type == "wide" and x.kind in PINNED for x in symbols)

@@ -46,7 +46,6 @@ class Target(Function):
             "broadcast": broadcast,
             "sum_lanes": sum_lanes,
             "comment": self.comment,
-            "whole": lambda x: self.trace.symbol("floor", x),
         }
         helpers["call"] = lambda kernel, arguments, like: self.kernel(kernel, *arguments)
         self.kernel: Interpreter = Interpreter(self, helpers, OWN, recording.REPLACED)
@@ -71,8 +70,9 @@ class Target(Function):
         """Return the name of a function of the target."""
         return f"update_{known['sensor'].name}" if "sensor" in known else function.__name__
 
-    def define(self, function: Any, name: str, sizes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    def define(self, function: Any, sizes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
         """Trace a function of the target: with parameters, what is known of the others, and the filter's state."""
+        name = self.name_of(function, known)
         m = Target(self.program, name, sizes, self.functions)
         m.words = known["sensor"].words if "sensor" in known else " ".join((function.__doc__ or "").split())
         tree = parsed(function)
@@ -96,7 +96,7 @@ class Target(Function):
 
     def _far_turn(self, phi: Any) -> tuple[Any, Any]:
         if "far_turn" not in self.functions:
-            self.define(body.far_turn, "far_turn", {"x": 0, "y": 0, "z": 0, "turn": -13}, {})
+            self.define(body.far_turn, {"x": 0, "y": 0, "z": 0, "turn": -13}, {})
         values = self.trace.symbol("tuple", "far_turn", 13, *phi)
         items = tuple(self.trace.symbol("item", values, i) for i in range(13))
         return items[:4], items[4:]
@@ -151,14 +151,14 @@ def traced(program: Program) -> list[Target]:
     r = program.recording
     m = Target(program, "", {}, {})
     if r is None:
-        m.define(body.init, "init", {"attitude": 4}, {})
-        m.define(body.predict, "predict", {"gyro": 3, "dt": 0}, {})
+        m.define(body.init, {"attitude": 4}, {})
+        m.define(body.predict, {"gyro": 3, "dt": 0}, {})
         for sensor in program.sensors:
-            m.define(body.update, f"update_{sensor.name}", {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
+            m.define(body.update, {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
     else:
-        m.define(recording.init, "init", {}, {})
+        m.define(recording.init, {}, {})
         sample = {"time": "wide", "gyro": 3, "accelerometer": 3} | ({"magnetometer": 3} if r.magnetometer else {})
-        m.define(recording.update, "update", sample, {"magnetometer": None})
+        m.define(recording.update, sample, {"magnetometer": None})
     functions = [target for target, _ in m.functions.values()]
     if r is not None and not r.magnetometer:
         functions[-1].words = functions[-1].words.partition(" magnetometer:")[0]

@@ -39,12 +39,17 @@ class Language:
     """Declaration of an array of zeros."""
     status: Callable[[str], str]
     """A status of the filter."""
-    whole: Callable[[str], str]
-    """A number rounded down."""
+    truncated: Callable[[str], str]
+    """A number as an integer, rounded towards zero."""
     real: Callable[[str], str]
     """An integer, or a duration (the difference of two times), as a number of the usual type."""
     quotient: Callable[[str], str]
     """A quotient of positive integers rounded down."""
+
+
+def vector(name: str, size: Any) -> list[str]:
+    """Return the elements of a parameter that is a vector."""
+    return [f"{name}[{i}]" for i in range(size)] if isinstance(size, int) else []
 
 
 class Writer:
@@ -101,7 +106,7 @@ class Writer:
         self.line(self.language.array(statement.text, size) if size else f"{declared} {statement.text};")
 
     def _if(self, statement: Statement) -> None:
-        self.line(f"if ({self.text(statement.values[0])}) {{")
+        self.line(f"if ({self._operand(statement.values[0], 0, right=False)}) {{")
         for i, block in enumerate(statement.blocks):
             if i and not block.statements:
                 continue
@@ -137,7 +142,9 @@ class Writer:
             if isinstance(value, str):
                 arguments.append(value)
             elif isinstance(value, tuple):
-                arguments.append(self.language.numbers(self.text(x) for x in value))
+                texts = [self.text(x) for x in value]
+                whole = [name for name, size in self.function.parameters if texts == vector(name, size)]
+                arguments.append(whole[0] if whole else self.language.numbers(texts))
             else:
                 arguments.append(self.text(value, "int" if isinstance(value, int) else ""))
         text = f"{statement.text}({', '.join(arguments)})"
@@ -225,8 +232,8 @@ class Writer:
 
     @functools.cached_property
     def user_here(self) -> set[Symbol]:
-        """Operations whose users are in the same slot, outside the arms of a selection."""
-        places, groups, here = self.placement.places, self.placement.groups, set()
+        """Operations whose users, statements ``if`` among them, are in the same slot, outside the arms of a selection."""
+        places, groups, here = self.placement.places, self.placement.groups, set(self.placement.conditions)
         for user in self.placement.alive:
             group = groups.get(user)
             if group is not None:
@@ -288,7 +295,7 @@ class Writer:
             inner = self._operand(operands[0], 6 if kind == "neg" else 0, right=kind == "neg")
             return f"-{inner}" if kind == "neg" else f"!({inner})"
         inner = ", ".join(self._as(symbol.type, x, 0, right=False) for x in operands)
-        return f"{language.function(kind)}({inner})" if kind in FUNCTIONS else language.whole(inner)
+        return f"{language.function(kind)}({inner})" if kind in FUNCTIONS else language.truncated(inner)
 
     def _binary(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
