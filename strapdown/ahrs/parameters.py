@@ -183,12 +183,12 @@ HAND_HELD = AhrsParameters(
     velocity_sigma=0.7,
     acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_sigma=0.054,
-    tilt_by_field=0.3,
-    max_tilt_by_field=0.36,
-    tilt_share=0.08,
-    heading_share=0.05,
-    heading_by_field=1.1,
+    tilt_sigma=0.042,
+    tilt_by_field=0.25,
+    max_tilt_by_field=0.38,
+    tilt_share=0.05,
+    heading_share=0.03,
+    heading_by_field=0.65,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
@@ -203,9 +203,8 @@ HAND_HELD_SMOOTHED = replace(
     usual_variation=1.4,
     tilt_by_field=0.08,
     max_tilt_by_field=0.165,
-    tilt_share=0.07,
-    heading_share=0.1,
-    heading_by_field=0.9,
+    tilt_share=0.04,
+    heading_by_field=0.95,
     gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
@@ -220,8 +219,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     velocity_time=1.0,
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
-    tilt_sigma=0.045,
-    tilt_share=0.15,
+    tilt_share=0.2,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the
