@@ -83,7 +83,11 @@ class Plain:
         )
         for a in () if program.recording is None else program.recording.arrays:
             setattr(self.f, a.name, np.zeros(a.shape, int if a.kind == "int" else float))
-        self.kernel, self.lowest = lambda function, *arguments: function(*arguments), math.floor
+        self.state, self.imu = self.f, None
+        if program.recording is not None:
+            self.imu = recording.imu_of(self)
+            self.on_target = PlainKernels(None, recording.helpers(self))
+        self.lowest = math.floor
         self.status, self.called, self.far_turns = 0, set(), 0
 
     def turned_far(self, condition):
@@ -140,8 +144,14 @@ class Plain:
     def comment(self, text):
         pass
 
-    def table(self, name, shape):
+    def kernel(self, function, *arguments):
+        return self.on_target.bound(function)(*arguments) if self.imu else function(*arguments)
+
+    def local(self, name, shape):
         return np.zeros(shape)
+
+    def passing(self, like):
+        return np.zeros_like(like)
 
     def clear_status(self):
         self.status = 0

@@ -349,14 +349,8 @@ def test_the_compiled_statistics_are_those_of_numpy():
         k = int(np.argmax(runs))
         assert (first, last) == (sum(runs[:k]), sum(runs[: k + 1]) - 1)
     samples[np.random.default_rng(3).random(600) < 0.2] = np.nan
-    ends, sums, number = np.empty((3, 2, 2)), np.empty((30, 2, 3)), np.empty(30)
+    ends = np.empty((3, 2, 2))
     compiled(recording_samples.extremes)(read_only(samples), ends)
     for column, found in zip(samples.T, ends, strict=True):
         extremes = [np.nanmax(column), np.nanmin(column)]
         assert found.tolist() == [[end, np.sum(column == end)] for end in extremes]
-    compiled(recording_samples.halves)(read_only(samples.reshape(30, 20, 3)), sums, number)
-    for block, found, count in zip(samples.reshape(30, 20, 3), sums, number, strict=True):
-        known = block[np.isfinite(block).all(axis=1)]
-        assert count == len(known)
-        middle = (len(known) + 1) // 2
-        np.testing.assert_array_equal(found, [known[:middle].sum(axis=0), known[middle:].sum(axis=0)])

@@ -15,6 +15,7 @@ from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, lengths
 from strapdown.kernels import headings as kernel
+from strapdown.kernels.first_state import iron_variance, sine_of_dip
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import hard_iron
 from strapdown.recordings.hard_iron import low_pass
@@ -111,8 +112,7 @@ def memory_of(constants: kernel.Constants) -> kernel.Memory:
 
 def first_variance(force: Array, field: Array, parameters: AhrsParameters) -> float:
     """Return the variance of the heading by constant iron, rad², from the first specific force and field (3,)."""
-    sine = float(force @ field) / float(np.linalg.norm(force) * np.linalg.norm(field))
-    return parameters.iron_sigma**2 / max(1.0 - sine**2, 1e-12)
+    return float(iron_variance(parameters.iron_sigma, sine_of_dip(force.tolist(), field.tolist())))
 
 
 def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:

@@ -16,12 +16,11 @@ from strapdown.checks import Array, InputError, instance, non_negative, positive
 from strapdown.estimation import live as estimation_live
 from strapdown.estimation.forward import TooPreciseError
 from strapdown.estimation.live import restart
-from strapdown.kernels import headings as k_headings
 from strapdown.kernels import live_imu as kernel
-from strapdown.kernels import recording_steps
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.live import TOO_PRECISE
 from strapdown.kernels.machine import address_of, compiled, read_only
+from strapdown.kernels.recording_steps import Carried, Stamps, Steps
 from strapdown.recordings.sensor_delays import ASSUMED_SIGMA, GIVEN_SIGMA
 from strapdown.records.recording import LARGEST_RATE, Recording
 from strapdown.vectors import VectorMeasurements
@@ -110,107 +109,87 @@ class LiveAhrs:
             else setup.states.blocks({series.sensor: series.kind for series in self._sensors}),
             sensors=self._sensors,
         )
-        sigma = ASSUMED_SIGMA if latency is None else GIVEN_SIGMA
-        self._imu = self._arrays(late, sigma)
-        self._call: Any = self._imu.filter.call.data
+        self._sample = np.zeros(10)
+        self._imu = self._arrays(late, ASSUMED_SIGMA if latency is None else GIVEN_SIGMA)
+        self._call: Any = self._sample.data
         self._table = packed(self._imu)
         dispatcher = compiled(kernel.take)
         self._kind = dispatcher.typeof_pyval(self._imu)
         self._take = dispatcher.compile(tuple(map(dispatcher.typeof_pyval, (self._kind, self._table, 0))))
-        self._bias_variance = self.parameters.bias_sigma**2
-        self._rests: list[tuple[Array, float]] = []
-        self._rested = math.nan
 
-    def _arrays(self, late: float, sigma: float) -> kernel.Imu:
+    def _arrays(self, late: float, delay_sigma: float) -> kernel.Imu:
         """Return the kernel's arrays."""
-        k, parameters = recording_steps, self.parameters
+        parameters, magnetometer = self.parameters, self.magnetometer
         most = MAX_SAMPLES_RATIO * max(1, math.ceil(parameters.step / self.interval)) + 2
-        parts, part = starting.rest_length(self.interval)
-        span = parts * part
-        time, rate, turned = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 4))
-        force, frame, edge = np.zeros((most, 3)), np.zeros((most, 4)), np.zeros(2, np.int64)
-        total, number, mean, turn = np.zeros((1, 3)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3))
-        stamps = k.Stamps(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 4)), np.full(2, late), np.zeros((2, 3)))
-        shapes = (1, 4), (1, 3), (1, 6), (1, 6, 6), (1,), (1,), (1,), (1,)
-        steps = k.Steps(np.zeros(1, np.int64), *(np.ones(shape) for shape in shapes))
-        self._found = k.Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
-        steps.iron[:] = 0.0
+        table = kernel.LASTING | kernel.PASSING
+        a: Any = kernel.Arrays(
+            **{
+                name: np.zeros([most if n == kernel.MOST else n for n in shape], np.int64 if kind == "int" else float)
+                for name, (shape, kind, _) in table.items()
+            }
+        )
         first, weight = regions.FIRST_LEVEL
-        field, field_total, field_number = np.zeros((most, 3)), np.zeros((1, 3)), np.zeros(1)
-        nis, field_level = np.zeros(1), np.full(1, first if self.magnetometer else 0.0)
-        forgotten = parameters.heading_interval / regions.FIELD_MEMORY
+        a.field_level[0], a.field_sums[:] = first if magnetometer else 0.0, (first * weight, weight)
         constants = headings.constants_of(parameters, max(parameters.step, self.interval))
-        memory = headings.memory_of(constants)
-        head_frame, head_end, head_length, head_time = np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1), np.zeros(1)
-        of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time, np.zeros(1))
-        head_steps = k_headings.Steps(*map(read_only, of_step))
-        heading_out = k_headings.Outputs(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
-        shares = regions.shares_of(parameters, magnetometer=self.magnetometer)
+        self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
+        self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
+        time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
-        carried = (
-            k.Steps(steps.edge, *map(read_only, steps[1:])),
-            k.Stamps(*map(read_only, stamps)),
-            regions.limits(parameters, sigma),
-            self._found,
+        estimate = [np.ones(shape) for shape in ((1, 4), (1, 3), (1, 6), (1, 6, 6))]
+        r = read_only
+        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.floor, a.heading, a.iron_variance)))
+        stamps = Stamps(*map(r, (a.times, a.rates, a.turns, np.full(2, late), a.ahead)))
+        of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
+        heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
+        at_rest = starting.kernel.Means(a.found_rate, a.found_rest)
+        arguments = kernel.Routines(
+            follow=(r(a.times), r(a.rates), a.turns),
+            average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
+            end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
+            scale=(
+                r(a.field_level),
+                regions.shares_of(parameters, magnetometer=magnetometer),
+                a.tilt,
+                a.floor,
+                a.heading,
+            ),
+            carry=(at_step, stamps, regions.limits(parameters, delay_sigma), self._found),
+            average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
+            head=(constants, headings.kernel.Steps(*map(r, of_step)), self._memory, headings.kernel.Outputs(*heading)),
+            field_mean=(r(a.nis), parameters.heading_interval / regions.FIELD_MEMORY, a.field_sums, a.field_level),
+            watch=(
+                starting.constants_of(self.interval, parameters),
+                *map(r, (time, gyro, force, field if magnetometer else field[:0])),
+                self._rests,
+                at_rest,
+            ),
+        )
+        routines = (
+            kernel.Routine(address_of(compiled(function), values), values)
+            for function, values in zip(kernel.KERNELS, arguments, strict=True)
         )
         return kernel.Imu(
-            filter=live._replace(call=np.zeros(kernel.FIELD + 3)),
-            magnetometer=int(self.magnetometer),
-            follow=_routine(k.follow_gyro, read_only(time), read_only(rate), turned),
-            average=_routine(k.average_samples, read_only(force), read_only(frame), edge, total, number),
-            end=_routine(k.end_steps, read_only(frame), edge, total, number, mean, turn),
-            scale=_routine(k.scale_factors, read_only(field_level), shares, steps.tilt, steps.floor, steps.heading),
-            carry=_routine(k.carry_to_stamps, *carried),
-            average_field=_routine(
-                k.average_samples, read_only(field), read_only(frame), edge, field_total, field_number
-            ),
-            head=_routine(k_headings.heading_steps, constants, head_steps, memory, heading_out),
-            field_mean=_routine(
-                k.running_mean, read_only(nis), forgotten, np.array([first * weight, weight]), field_level
-            ),
-            interval=self.interval,
-            step=parameters.step,
-            noise=parameters.specific_force_noise,
-            largest_rate=LARGEST_RATE,
-            late=late,
-            start=np.zeros(1),
-            time=time,
-            rate=rate,
-            turned=turned,
-            force=force,
-            frame=frame,
-            edge=edge,
-            number=number,
-            mean=mean,
-            turn=turn,
-            state=state,
-            numbers=numbers,
-            places=places,
-            attitude=steps.attitude,
-            bias=steps.bias,
-            variance=steps.variance,
-            covariance=steps.covariance,
-            stamp_time=stamps.time,
-            stamp_rate=stamps.rate,
-            stamp_turned=stamps.turned,
-            ahead=stamps.ahead,
-            field=field,
-            field_number=field_number,
-            head_frame=head_frame,
-            head_length=head_length,
-            head_end=head_end,
-            head_time=head_time,
-            head_start=memory.start,
-            direction=heading_out.direction,
-            sigma=heading_out.sigma,
-            iron_variance=heading_out.variance,
-            iron=steps.iron,
-            field_nis=nis,
-            span_field=np.zeros((span, 3)),
-            span_time=np.zeros(span),
-            span_rate=np.zeros((span, 3)),
-            span_force=np.zeros((span, 3)),
-            in_span=np.zeros(1, np.int64),
+            live,
+            int(magnetometer),
+            int(parameters.rest_bias_sigma > 0.0),
+            self.interval,
+            parameters.step,
+            parameters.specific_force_noise,
+            LARGEST_RATE,
+            late,
+            time,
+            gyro,
+            force,
+            field,
+            a,
+            self._rests.resting,
+            self._memory.start,
+            kernel.Routines(*routines),
+            state,
+            numbers,
+            places,
+            np.zeros(1, np.int64),
+            *estimate,
         )
 
     # ---------------------------------------------------------------------------------------------------------------------- samples
@@ -264,12 +243,16 @@ class LiveAhrs:
             raise InputError(
                 f"{name} is {sample!r}; give {'one number' if name == 'time' else 'three numbers'}"
             ) from None
-        if math.isnan(self._rested):
+        if self._imu.arrays.count[0] == 0:
             self._begin()
             return
         code = self._take(self._kind, self._table, kernel.SAMPLE)
-        if code:
-            self._take_flags(code)
+        if code < 0:
+            self._refuse(code)
+        if code == kernel.RESTED:
+            rate, sigma = self._rests.rest_rate[0], math.sqrt(self._rests.rest_variance[0])
+            restart(self._filter, starting.with_rate_at_rest(self._filter.state(), rate, sigma), self._call[0])
+            self._imu.resting[1] = 0
 
     def _begin(self) -> None:
         """Start at the sample in the call, if it has a specific force and, with a magnetometer, a field."""
@@ -278,47 +261,21 @@ class LiveAhrs:
         size = np.linalg.norm(sample, axis=1)
         if not (0.0 < size[1] < math.inf and (not self.magnetometer or 0.0 < size[2] < math.inf)):
             return
-        code = self._take(self._kind, self._table, kernel.FIRST_SAMPLE)
-        if code >= 0:
-            first = Recording(
-                source="the first sample",
-                time=np.array([time, time + self.interval]),
-                rate=np.array([sample[0], sample[0]]),
-                specific_force=np.array([sample[1], sample[1]]),
-                magnetic_field=np.array([sample[2], sample[2]]) if self.magnetometer else None,
-            )
-            restart(self._filter, starting.start(first, np.array([[1.0, 0.0, 0.0, 0.0]] * 2), self.parameters), time)
-            self._rested = time
-            if self.magnetometer:
-                self._imu.iron[0] = headings.first_variance(sample[1], sample[2], self.parameters)
-            self._take(self._kind, self._table, kernel.START)
-        if code:
-            self._take_flags(code)
-
-    def _take_flags(self, code: int) -> None:
-        """Refuse a sample, or measure the bias at rest and correct it at the end of the step."""
+        code = self._take(self._kind, self._table, kernel.CHECK)
         if code < 0:
             self._refuse(code)
-        if code & kernel.REST and self.parameters.rest_bias_sigma > 0.0:
-            self._find_rest()
-        if code & kernel.STEP and self._rests:
-            for rate, sigma in self._rests:
-                restart(self._filter, starting.with_rate_at_rest(self._filter.state(), rate, sigma), self._call[0])
-            self._rests.clear()
-
-    def _find_rest(self) -> None:
-        """Measure the bias, if the unit was at rest over the last span."""
-        imu, parameters = self._imu, self.parameters
-        parts, part = starting.rest_length(self.interval)
-        mean, sigma = starting.mean_rates(imu.span_rate, parts, part, parameters)
-        if not sigma[0] < starting.MAX_REST_SIGMA:
-            return
-        if starting.are_rests(imu.span_time[None], (imu.span_force[None], imu.span_field[None]), mean)[0]:
-            time = self._call[0]
-            measured = starting.bias_variance(self._bias_variance, time - self._rested, sigma[0], parameters)
-            if measured is not None:
-                self._bias_variance, self._rested = measured, time
-                self._rests.append((mean[0], float(sigma[0])))
+        first = Recording(
+            source="the first sample",
+            time=np.array([time, time + self.interval]),
+            rate=np.array([sample[0], sample[0]]),
+            specific_force=np.array([sample[1], sample[1]]),
+            magnetic_field=np.array([sample[2], sample[2]]) if self.magnetometer else None,
+        )
+        restart(self._filter, starting.start(first, np.array([[1.0, 0.0, 0.0, 0.0]] * 2), self.parameters), time)
+        if self.magnetometer:
+            self._imu.arrays.iron_variance[0] = headings.first_variance(sample[1], sample[2], self.parameters)
+        self._rests.rest_clock[1] = time
+        self._take(self._kind, self._table, kernel.START)
 
     def _refuse(self, code: int) -> NoReturn:
         """Raise the error for a sample that the kernel refuses."""
@@ -340,7 +297,7 @@ class LiveAhrs:
     @property
     def time(self) -> float:
         """Time of the estimate, s: that of the last sample."""
-        return float(self._imu.time[1])
+        return float(self._imu.arrays.clock[0])
 
     @property
     def attitude(self) -> Array:
@@ -363,11 +320,8 @@ class LiveAhrs:
         return np.array(self._found.covariance[1])
 
 
-def arrays_of(live: LiveAhrs) -> tuple[kernel.Imu, list[VectorMeasurements]]:
-    """Return the kernel's arrays, and the sensors."""
-    return live._imu, live._sensors
-
-
-def _routine(function: Any, *arguments: Any) -> kernel.Routine:
-    """Return a kernel of recordings with its arguments."""
-    return kernel.Routine(address_of(compiled(function), arguments), arguments)
+def arrays_of(
+    live: LiveAhrs,
+) -> tuple[kernel.Imu, headings.kernel.Memory, starting.kernel.Memory, list[VectorMeasurements]]:
+    """Return the kernel's arrays, the memory of the field and of rests, and the sensors."""
+    return live._imu, live._memory, live._rests, live._sensors

@@ -10,7 +10,8 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
-from strapdown.kernels import recording_samples
+from strapdown.kernels import first_state, recording_samples
+from strapdown.kernels import rests as kernel
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.rotation import moved, unit
 from strapdown.recordings import Recording
@@ -124,20 +125,29 @@ def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> es
     """
     assert recording.specific_force is not None
     force = first_vector(recording.specific_force, turned, recording.source, "accelerometer")
-    moved = float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0
-    swing = SWING_TIME * float(np.linalg.norm(recording.rate[0]))
-    tilt = min(float(np.linalg.norm([parameters.attitude_sigma, moved, swing])), MAX_TILT_SIGMA)
-    P = np.diag(np.repeat([tilt**2, parameters.bias_sigma**2], 3))
     across = np.eye(3)[np.argmin(np.abs(force))]
     if recording.magnetic_field is not None:
         across = first_vector(recording.magnetic_field, turned, recording.source, "magnetometer")
-    attitude = wahba.from_vertical_and_heading(force, across)
+    attitude, constants = wahba.from_vertical_and_heading(force, across), start_constants(parameters)
+    tilt = first_state.tilt_variance(constants, force.tolist(), recording.rate[0].tolist())
+    P = np.diag(np.repeat([tilt, parameters.bias_sigma**2], 3))
     if recording.magnetic_field is not None:
         up = force / np.linalg.norm(force)
-        sine = float(up @ across) / float(np.linalg.norm(across))
-        level = max(1.0 - sine**2, MIN_LEVEL)
-        P[:3, :3] += np.outer(up, up) * ((sine * tilt) ** 2 + FIRST_HEADING**2) / level
+        sine = first_state.sine_of_dip(force.tolist(), across.tolist())
+        P[:3, :3] += np.outer(up, up) * first_state.heading_variance(constants, sine, tilt)
     return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
+
+
+def start_constants(parameters: AhrsParameters) -> first_state.Constants:
+    """Return the constants of the variances at the start."""
+    return first_state.Constants(
+        attitude_sigma=parameters.attitude_sigma,
+        max_tilt_sigma=MAX_TILT_SIGMA,
+        swing_time=SWING_TIME,
+        gravity=STANDARD_GRAVITY,
+        min_level=MIN_LEVEL,
+        field_sigma=FIRST_HEADING,
+    )
 
 
 class Rests(NamedTuple):
@@ -155,27 +165,19 @@ NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0))
 
 
 def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
-    """Return the spans in which the unit hardly moves.
-
-    σ of the mean rate is the root sum of squares of ``rest_bias_sigma`` and the spread of the rate between tenths of the span, which is
-    motion of the hand. Spans with which the vertical or the field rotates are left out: a steady turn is no bias.
-    """
+    """Return the spans in which the unit hardly moves: :func:`strapdown.kernels.rests.find_rest`."""
     if parameters.rest_bias_sigma == 0.0:
         return NO_REST
-    parts, part = rest_length(recording.interval)
-    length = parts * part
+    constants, memory = constants_of(recording.interval, parameters), memory_of(recording.interval, parameters)
+    length = constants.parts * constants.part
     n = len(recording.time) // length
-    mean, sigma = mean_rates(recording.rate[: n * length], parts, part, parameters)
-    quiet = np.flatnonzero(sigma < MAX_REST_SIGMA)
-    vectors = (recording.specific_force, recording.magnetic_field)
-    taken = (None if samples is None else _spans(samples, n, length)[quiet] for samples in vectors)
-    quiet = quiet[are_rests(_spans(recording.time, n, length)[quiet], tuple(taken), mean[quiet])]
-    return Rests(length * (quiet + 1) - 1, mean[quiet], sigma[quiet])
-
-
-def _spans(samples: Array, n: int, length: int) -> Array:
-    """Return the first samples (n, length, …) of n spans."""
-    return samples[: n * length].reshape(n, length, *samples.shape[1:])
+    means = kernel.Means(np.empty((n, 3)), np.empty(n))
+    field = np.empty((0, 3)) if recording.magnetic_field is None else recording.magnetic_field
+    assert recording.specific_force is not None
+    samples = recording.time, recording.rate, recording.specific_force, field
+    compiled(kernel.find_rests)(constants, *map(read_only, samples), memory, means)
+    (quiet,) = np.nonzero(np.isfinite(means.variance))
+    return Rests(length * (quiet + 1) - 1, means.rate[quiet], np.sqrt(means.variance[quiet]))
 
 
 def rest_length(interval: float) -> tuple[int, int]:
@@ -185,57 +187,42 @@ def rest_length(interval: float) -> tuple[int, int]:
     return parts, length // parts
 
 
-def mean_rates(rate: Array, parts: int, part: int, parameters: AhrsParameters) -> tuple[Array, Array]:
-    """Return the mean rates (n, 3) of spans, each of ``parts`` parts of ``part`` samples, and their σ (n,) as measurements of the bias."""
-    tenths = _blocks(rate, part)[0].reshape(-1, parts, 3)
-    mean = tenths.mean(axis=1)
-    spread = np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / parts
-    return mean, np.hypot(parameters.rest_bias_sigma, np.sqrt(spread))
+def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constants:
+    """Return the kernel's constants at this interval of the samples, s."""
+    parts, part = rest_length(interval)
+    return kernel.Constants(
+        parts=parts,
+        part=part,
+        span=QUIET_SPAN,
+        own_variance=parameters.rest_bias_sigma**2,
+        max_variance=MAX_REST_SIGMA**2,
+        turning=TURNING_RATE**2,
+        walk=parameters.rate_random_walk**2,
+    )
 
 
-def are_rests(time: Array, vectors: tuple[Array | None, ...], rate: Array) -> np.ndarray:
-    """Return which spans have no gap, and vertical and field that rotate at no more than half their mean rate (m,).
-
-    ``time`` (m, length); ``vectors``: specific force, which half of the samples must have, and field (m, length, 3); ``rate`` (m, 3).
-    """
-    force = vectors[0]
-    if force is None:
-        return np.zeros(len(time), bool)
-    held = np.mean(np.isfinite(force[:, :, 0]), axis=1) > 0.5
-    rests = np.asarray((time[:, -1] - time[:, 0] < 1.5 * QUIET_SPAN) & held)
-    turning = np.flatnonzero(rests & (lengths(rate) > TURNING_RATE))
-    expected, change = np.zeros((2, len(turning), 3 * len(vectors)))
-    for k, samples in enumerate(vectors):
-        if samples is None:
-            continue
-        halves, number = np.empty((len(turning), 2, 3)), np.empty(len(turning))
-        compiled(recording_samples.halves)(read_only(samples[turning]), halves, number)
-        size = lengths(halves.sum(axis=1)) / np.maximum(number, 1)
-        valid = np.asarray((number > 1) & (size > 0.0))
-        share = np.stack([np.ceil(0.5 * number[valid]), np.floor(0.5 * number[valid])], axis=1)
-        halves = halves[valid] / (share * size[valid, None])[:, :, None]
-        columns = slice(3 * k, 3 * k + 3)
-        change[valid, columns] = halves[:, 1] - halves[:, 0]
-        expected[valid, columns] = -0.5 * QUIET_SPAN * np.cross(rate[turning[valid]], 0.5 * halves.sum(axis=1))
-    rests[turning] = np.sum(expected * change, axis=1) <= 0.5 * np.sum(expected**2, axis=1)
-    return rests
+def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
+    """Return the kernel's memory before the first sample."""
+    return kernel.Memory(
+        tenths=np.zeros((rest_length(interval)[0], 3)),
+        halves=np.zeros((4, 3)),
+        halves_number=np.zeros(4, np.int64),
+        resting=np.zeros(2, np.int64),
+        rest_rate=np.zeros((1, 3)),
+        rest_variance=np.array([np.inf, parameters.bias_sigma**2]),
+        rest_clock=np.zeros(2),
+    )
 
 
 def informative(at_rest: Rests, time: Array, parameters: AhrsParameters) -> Rests:
     """Return those spans whose σ is below that of the bias by the spans before: a long rest is measured once, and again as it drifts."""
     variance, before, kept = parameters.bias_sigma**2, time[0], []
     for k, (last, sigma) in enumerate(zip(at_rest.last, at_rest.sigma, strict=True)):
-        measured = bias_variance(variance, time[last] - before, sigma, parameters)
-        if measured is not None:
-            variance, before = measured, time[last]
+        drifted = variance + parameters.rate_random_walk**2 * (time[last] - before)
+        if sigma**2 < drifted:
+            variance, before = kernel.combined(drifted, sigma**2), time[last]
             kept.append(k)
     return Rests(at_rest.last[kept], at_rest.rate[kept], at_rest.sigma[kept])
-
-
-def bias_variance(variance: float, since: float, sigma: float, parameters: AhrsParameters) -> float | None:
-    """Return the variance of the bias after a measurement with σ, a time since the last one; None if σ is above that of the bias."""
-    drifted = variance + parameters.rate_random_walk**2 * since
-    return float(1.0 / (1.0 / drifted + 1.0 / sigma**2)) if sigma**2 < drifted else None
 
 
 def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> estimation.State:

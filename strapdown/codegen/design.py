@@ -70,13 +70,18 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
 
 def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
     """Return the program of the filter of an IMU."""
-    imu, sensors = arrays_of(live)
+    imu, field, rest, sensors = arrays_of(live)
     program = program_of(live.parameters.setup, sensors, single=single)
     return replace(
         program,
         sensors=tuple(replace(sensor, noise=()) for sensor in program.sensors),
         recording=Recording(
-            magnetometer=live.magnetometer, interval=live.interval, parameters=live.parameters, imu=imu
+            magnetometer=live.magnetometer,
+            interval=live.interval,
+            parameters=live.parameters,
+            imu=imu,
+            field=field,
+            rest=rest,
         ),
     )
 

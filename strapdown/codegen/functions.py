@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,10 +36,10 @@ class Statement:
 
 
 class Member(Values):
-    """An array of the target with rows, whose elements have indices that may be known only there."""
+    """An array with rows; on the target, where the indices of its elements may be known only there, or without a name, while tracing."""
 
     def __init__(self, function: Function, base: str, shape: tuple[int, ...], kind: str = "") -> None:
-        super().__init__(function.trace, lambda i: f"{base}[{i}]", kind)
+        super().__init__(function.trace, (lambda i: f"{base}[{i}]") if base else None, kind)
         self.function, self.base, self.shape = function, base, shape
         function.changing.add(base)
 
@@ -69,6 +70,18 @@ class Member(Values):
         self.function.flush()
         self.function.add(Statement("put", self.base, values=(place, value)))
         self.forget()
+
+
+class Local(Member):
+    """A local array of the target, which is declared if it is used."""
+
+    declared = False
+
+    def _place(self, index: Any) -> Any:
+        if not self.declared:
+            self.declared = True
+            self.function.body.statements.insert(0, Statement("array", self.base, values=(math.prod(self.shape),)))
+        return super()._place(index)
 
 
 class Variable(Values):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from strapdown.codegen import program as body
 from strapdown.codegen import recording
-from strapdown.codegen.functions import Function, Member, Statement
+from strapdown.codegen.functions import Function, Local, Member, Statement
 from strapdown.codegen.interpreted import Interpreter
 from strapdown.codegen.program import Program, work_size
 from strapdown.codegen.symbols import Symbol, Values
@@ -61,19 +62,25 @@ class Target(Function):
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
             dt=self.array(lambda i: "f->step_dt"),
         )
+        self.imu: Any = None
         if program.recording is not None:
             for a in program.recording.arrays:
                 setattr(self.state, a.name, Member(self, f"f->{a.name}", a.shape, a.kind))
-            self.spaces = {"memory": self.state, "constants": program.recording.constants}
+            self.imu = recording.imu_of(self)
+            self.kernel.helpers |= recording.helpers(self)
+            self.spaces = {"memory": self.state, "constants": self.imu.routines.head.arguments[0]}
 
     def another(self, name: str, parameters: Sequence[tuple[str, Any]], words: str) -> Target:
         """Return another function of the filter, not yet traced."""
         return Target(self.program, name, parameters, returns="", words=words, functions=self.functions)
 
-    def table(self, name: str, shape: tuple[int, ...]) -> Member:
-        """Return a local array with rows."""
-        self.add(Statement("array", name, values=(math.prod(shape),)))
-        return Member(self, name, shape)
+    def local(self, name: str, shape: tuple[int, ...]) -> Member:
+        """Return a local array with rows, declared if it is used."""
+        return Local(self, name, shape)
+
+    def passing(self, like: np.ndarray) -> Member:
+        """Return an array as one of Python, which exists while tracing."""
+        return Member(self, "", like.shape)
 
     def lowest(self, x: Any) -> Any:
         """Return x rounded down, however large."""
@@ -102,7 +109,7 @@ class Target(Function):
 
     def work(self) -> Member:
         """Return work space."""
-        return self.table("work", (work_size(self.kernels),))
+        return self.local("work", (work_size(self.kernels),))
 
     def clear_status(self) -> None:
         """Clear the flags."""
@@ -193,8 +200,10 @@ def traced(program: Program) -> list[Target]:
         functions.append(function(body.update, *values, returns="status", **named))
     if r is None:
         return functions
-    last = [] if r.rest is None else [function(recording.find_rest), function(recording.use_rest)]
-    last += [function(recording.carry), function(recording.end_step), function(recording.init, returns="status")]
+    at_rest = recording.find_rest, recording.clear_span, recording.use_rest
+    last = [*map(function, at_rest)] if r.imu.rests else []
+    last += [function(recording.carry_to_sample), function(recording.end_step)]
+    last.append(function(recording.init, returns="status"))
     sample = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)][: 3 + r.magnetometer]
     words = " ".join((recording.update.__doc__ or "").split())
     words = words if r.magnetometer else words.partition(" magnetometer:")[0]

@@ -215,7 +215,7 @@ class Writer:
             self.indent += 1
             self._symbols(self.placement.needed((m.operands[i] for m in members), arm, self.written), arm)
             for name, member in zip(names, members, strict=True):
-                self.line(f"{name} = {self._as(member.type, member.operands[i], 0, right=False)};")
+                self.line(f"{name} = {self._as(member.type, member.operands[i], 0, right=False, kind=member.type)};")
             self.indent -= 1
         self.line("}")
         for name, member in zip(names, members, strict=True):
@@ -289,7 +289,7 @@ class Writer:
             array = self._member(operands[0]) if kind == "at" else self.names[operands[0]]
             return f"{array}[{self._operand(operands[1], 0, right=False, kind='int')}]"
         if kind == "select":
-            a, b = (self._as(symbol.type, x, 5, right=True) for x in operands[1:])
+            a, b = (self._as(symbol.type, x, 5, right=True, kind=symbol.type) for x in operands[1:])
             return f"{self._operand(operands[0], 5, right=True)} ? {a} : {b}"
         if kind in ("neg", "not"):
             inner = self._operand(operands[0], 6 if kind == "neg" else 0, right=kind == "neg")

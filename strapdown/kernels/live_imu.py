@@ -1,7 +1,7 @@
-"""Samples of an IMU as they come, by the kernels that process a recording: what :class:`strapdown.ahrs.LiveAhrs` does with each sample.
+"""Samples of an IMU as they come: what :class:`strapdown.ahrs.LiveAhrs` does with each, and the exported filter of an IMU too.
 
 Each kernel of a recording is called by its address for one step, or for one stamp, on arrays of two rows, so its bits are those of the
-recording's run.
+recording's run. :mod:`strapdown.codegen.recording` executes the same functions on symbols.
 """
 
 from __future__ import annotations
@@ -12,16 +12,71 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from strapdown.kernels.argument_tables import call, unpacked
-from strapdown.kernels.live import FIRST, GYRO, LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
+from strapdown.kernels.headings import heading_steps
+from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
+from strapdown.kernels.recording_steps import (
+    average_samples,
+    carry_to_stamps,
+    end_steps,
+    follow_gyro,
+    running_mean,
+    scale_factors,
+)
+from strapdown.kernels.rests import find_rests
 
-FIRST_SAMPLE, START, SAMPLE = range(3)
-"""What to do: take the first sample, show the state in which the filter starts at it, or take another sample."""
-FIELD = FIRST + 3
-"""Place of the magnetometer in a call."""
-STEP, REST = 1, 2
-"""Flags of a result: a step of the filter ended, a span in which rest is looked for ended."""
+CHECK, START, SAMPLE = range(3)
+"""What to do with a sample: check it, start at it, or take it."""
+RESTED = 1
+"""Result: a step ended after a rest that shows the bias."""
 NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST = range(-25, -20)
 """Refusals."""
+
+MOST = -1
+"""In a shape: the most samples of a step."""
+LASTING = {
+    "rate": ((3,), "", "last rate, rad/s"),
+    "turned": ((4,), "", "attitude by the gyro alone, since the start"),
+    "force": ((MOST, 3), "", "specific force at the samples of this step"),
+    "frame": ((MOST, 4), "", "attitude by the gyro at its start and at its samples"),
+    "tilt": ((1,), "", "factor on sigma of the tilt"),
+    "floor": ((1,), "", "variance that is added to that of the tilt, rad^2"),
+    "heading": ((1,), "", "factor on sigma of the heading"),
+    "iron_variance": ((1,), "", "variance that is added to that of the heading, rad^2"),
+    "field": ((MOST, 3), "", "field at the samples of this step"),
+    "field_level": ((1,), "", "mean nis of the magnetometer"),
+    "field_sums": ((2,), "", "its sums"),
+    "clock": ((3,), "wide", "time of the last sample, of the start of the step, of the first sample, s"),
+    "count": ((2,), "int", "whether the filter has started; samples in the step"),
+}
+"""Arrays that last from one sample to the next: shape; ``"wide"`` (double in single precision too) or ``"int"``; and what they are."""
+PASSING = {
+    "times": ((2,), "wide", "of the last sample or of the start of the step, and of this sample, s"),
+    "rates": ((2, 3), "", "at these times, rad/s"),
+    "turns": ((2, 4), "", "attitude by the gyro there"),
+    "ahead": ((2, 3), "", "rotation over the delay there"),
+    "edge": ((2,), "int", "0 and the number of samples in the step"),
+    "total": ((1, 3), "", "sum of the specific force of the step, in the frame fixed by the gyro"),
+    "number": ((1,), "", "number of its samples"),
+    "mean": ((1, 3), "", "their mean at the end of the step, body axes"),
+    "turn": ((1, 3), "", "rotation over the step"),
+    "field_total": ((1, 3), "", "sum of the field"),
+    "field_number": ((1,), "", "number of its samples"),
+    "length": ((1,), "", "duration that they cover, s"),
+    "middle": ((1, 4), "", "attitude by the gyro in the middle of the step"),
+    "end": ((1, 4), "", "and at its end"),
+    "now": ((1,), "wide", "time of its end, s"),
+    "turn_variance": ((1,), "", "0: the rotation over the step is as certain as ever"),
+    "nis": ((1,), "", "NIS of the heading"),
+    "found_direction": ((1, 3), "", "heading measurement at the end of the step"),
+    "found_sigma": ((1,), "", "its sigma; 0: none"),
+    "found_usual": ((1, 2), "", "usual magnitude and dip of the field"),
+    "found_iron": ((1, 3), "", "iron subtracted"),
+    "found_variance": ((1,), "", "variance of the heading by constant iron"),
+    "found_rate": ((1, 3), "", "mean rate at rest"),
+    "found_rest": ((1,), "", "its variance"),
+}
+"""Arrays that are written anew for each sample or step."""
+Arrays: Any = NamedTuple("Arrays", [(name, np.ndarray) for name in (*LASTING, *PASSING)])  # type: ignore[misc]
 
 
 class Routine(NamedTuple):
@@ -31,21 +86,41 @@ class Routine(NamedTuple):
     arguments: tuple[Any, ...]
 
 
+class Routines(NamedTuple):
+    """The kernels of a recording, with the arrays of the samples."""
+
+    follow: Any
+    average: Any
+    end: Any
+    scale: Any
+    carry: Any
+    average_field: Any
+    head: Any
+    field_mean: Any
+    watch: Any
+
+
+KERNELS = Routines(
+    follow=follow_gyro,
+    average=average_samples,
+    end=end_steps,
+    scale=scale_factors,
+    carry=carry_to_stamps,
+    average_field=average_samples,
+    head=heading_steps,
+    field_mean=running_mean,
+    watch=find_rests,
+)
+
+
 class Imu(NamedTuple):
-    """Arrays of an IMU's samples and of the kernels that process them."""
+    """A filter of an IMU: constants, arrays, and the kernels that process them."""
 
     filter: Live
-    """Its ``call`` has the sample: time, gyro, accelerometer and magnetometer."""
     magnetometer: int
     """Whether there is one."""
-    follow: Routine
-    average: Routine
-    end: Routine
-    scale: Routine
-    carry: Routine
-    average_field: Routine
-    head: Routine
-    field_mean: Routine
+    rests: int
+    """Whether the bias is measured at rest."""
     interval: float
     """Usual interval of the samples, s."""
     step: float
@@ -55,217 +130,216 @@ class Imu(NamedTuple):
     largest_rate: float
     late: float
     """Delay of the samples, s."""
-    start: np.ndarray
-    """Time of the first sample (1,)."""
     time: np.ndarray
-    rate: np.ndarray
-    turned: np.ndarray
-    """The last two samples (2,), (2, 3), and the attitude by the gyro at them (2, 4)."""
-    force: np.ndarray
-    frame: np.ndarray
-    """Specific force and attitude by the gyro at the samples of the step, after that at its start (most, 3), (most, 4)."""
-    edge: np.ndarray
-    """0 and the number of samples in the step (2,)."""
-    number: np.ndarray
-    """Number of them with a specific force (1,)."""
-    mean: np.ndarray
-    turn: np.ndarray
+    gyro: np.ndarray
+    accelerometer: np.ndarray
+    magnetic: np.ndarray
+    """The sample (1,), (1, 3)."""
+    arrays: Any
+    """:data:`LASTING` and :data:`PASSING`."""
+    resting: np.ndarray
+    """Of :class:`strapdown.kernels.rests.Memory`."""
+    first: np.ndarray
+    """Time of the first sample, of :class:`strapdown.kernels.headings.Memory`."""
+    routines: Routines
     state: np.ndarray
     """Attitude and bias of the filter (7 or more,)."""
     numbers: np.ndarray
     places: np.ndarray
     """Numbers of its covariance, and the place in them of each element of that of attitude and bias (6, 6)."""
+    refused: np.ndarray
+    """Refusal of the filter (1,)."""
     attitude: np.ndarray
     bias: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
     """Estimate at the start of the step (1, 4), (1, 3), (1, 6), (1, 6, 6)."""
-    stamp_time: np.ndarray
-    stamp_rate: np.ndarray
-    stamp_turned: np.ndarray
-    ahead: np.ndarray
-    """Start of the step and last sample: time (2,), rate (2, 3), attitude by the gyro (2, 4), rotation over the delay (2, 3)."""
-    field: np.ndarray
-    """Field at the samples of the step (most, 3)."""
-    field_number: np.ndarray
-    """Number of them with a field (1,)."""
-    head_frame: np.ndarray
-    head_length: np.ndarray
-    head_end: np.ndarray
-    head_time: np.ndarray
-    """Attitude by the gyro in the middle of the step, duration of the field's samples, attitude and time at the end (1, …)."""
-    head_start: np.ndarray
-    """Time of the first sample first (2,)."""
-    direction: np.ndarray
-    sigma: np.ndarray
-    """Heading measurement at the end of the step (1, 3), and its σ (1,); 0: none."""
-    iron_variance: np.ndarray
-    """Variance of the heading by constant iron, at the end of the step (1,), and as reported (1,)."""
-    iron: np.ndarray
-    field_nis: np.ndarray
-    """NIS of the last heading (1,)."""
-    span_time: np.ndarray
-    span_rate: np.ndarray
-    span_force: np.ndarray
-    span_field: np.ndarray
-    """Samples of the span in which rest is looked for (length,), (length, 3)."""
-    in_span: np.ndarray
-    """Number of them (1,)."""
 
 
 def take(kind, table, task):
-    """Process the sample in the call; return flags, or a refusal, which leaves everything as it was."""
+    """Process a sample; return ``RESTED`` or 0, or a refusal, which leaves everything as it was."""
     imu = unpacked(kind, table)
-    flags = 0
     if task != START:
-        flags = refusal(imu, task)
-        if flags < 0:
-            return flags
-        flags = keep_for_rest(imu)
-    if task == FIRST_SAMPLE:
-        begin(imu)
-        return flags
+        code = refusal(imu)
+        if code < 0 or task == CHECK:
+            return code
+    imu.refused[0] = 0
     if task == START:
-        show_step(imu)
-    elif turn_with_gyro(imu):
-        ended = end_step(imu)
-        if ended < 0:
-            return ended
-        flags += STEP
-    write_stamp(imu, 1)
-    call(imu.carry.address, imu.carry.arguments, ())
-    return flags
+        start(imu)
+    else:
+        take_sample(imu)
+    if imu.refused[0] < 0:
+        return imu.refused[0]
+    return RESTED if imu.resting[1] == 2 else 0
 
 
-def refusal(imu, task):
+def refusal(imu):
     """Return the reason to refuse a sample, or 0."""
-    call = imu.filter.call
-    if not abs(call[TIME]) < math.inf:
+    a, started = imu.arrays, imu.arrays.count[0] > 0
+    if not abs(imu.time[0]) < math.inf:
         return NO_TIME
-    if task != FIRST_SAMPLE and call[TIME] <= imu.time[1]:
+    if started and imu.time[0] <= a.clock[0]:
         return BEHIND
     for i in range(3):
-        if math.isnan(call[GYRO + i]):
+        if math.isnan(imu.gyro[0, i]):
             return NO_GYRO
         if (
-            abs(call[GYRO + i]) > imu.largest_rate
-            or abs(call[FIRST + i]) == math.inf
-            or abs(call[FIELD + i]) == math.inf
+            abs(imu.gyro[0, i]) > imu.largest_rate
+            or abs(imu.accelerometer[0, i]) == math.inf
+            or abs(imu.magnetic[0, i]) == math.inf
         ):
             return INFINITE
-    if task != FIRST_SAMPLE and imu.edge[1] + 1 >= len(imu.force):
+    if started and a.count[1] + 1 >= len(a.force):
         return TOO_FAST
     return 0
 
 
-def keep_for_rest(imu):
-    """Write the sample to the span in which rest is looked for; return ``REST`` if it is the last one of the span."""
-    k = imu.in_span[0]
-    imu.span_time[k] = imu.filter.call[TIME]
+def start(imu):
+    """Start at the sample: the state of the filter is that at it, and the attitude by the gyro the identity."""
+    a = imu.arrays
     for i in range(3):
-        imu.span_rate[k, i] = imu.filter.call[GYRO + i]
-        imu.span_force[k, i] = imu.filter.call[FIRST + i]
-        imu.span_field[k, i] = imu.filter.call[FIELD + i]
-    imu.in_span[0] = (k + 1) % len(imu.span_time)
-    return REST if k + 1 == len(imu.span_time) else 0
-
-
-def write_sample(imu, row):
-    """Write time and rate of the sample to a row of the last two."""
-    imu.time[row] = imu.filter.call[TIME]
-    for i in range(3):
-        imu.rate[row, i] = imu.filter.call[GYRO + i]
-
-
-def write_stamp(imu, row):
-    """Write the last sample to a row of the stamps."""
-    imu.stamp_time[row] = imu.time[1]
-    for i in range(3):
-        imu.stamp_rate[row, i] = imu.rate[1, i]
-        imu.ahead[row, i] = imu.rate[1, i] * imu.late
+        a.clock[i] = imu.time[0]
+        a.rate[i] = imu.gyro[0, i]
     for i in range(4):
-        imu.stamp_turned[row, i] = imu.turned[1, i]
-
-
-def begin(imu):
-    """Start at the first sample, with the identity as attitude by the gyro."""
-    write_sample(imu, 1)
-    imu.start[0] = imu.time[1]
-    imu.head_start[0] = imu.time[1]
-    imu.filter.clock[0] = imu.time[1]
-    for i in range(4):
-        imu.turned[1, i] = 1.0 if i == 0 else 0.0
+        a.turned[i] = 1.0 if i == 0 else 0.0
+    if imu.magnetometer > 0:
+        imu.first[0] = imu.time[0]
+    a.count[0] = 1
     begin_step(imu)
+    carry_to_sample(imu)
+    look_for_rest(imu, False)
 
 
-def begin_step(imu):
-    """Start a step at the last sample."""
-    imu.edge[1] = 0
-    for i in range(4):
-        imu.frame[0, i] = imu.turned[1, i]
-    write_stamp(imu, 0)
+def take_sample(imu):
+    """Take a sample after the first one."""
+    ended = turn_with_gyro(imu)
+    if ended:
+        end_step(imu)
+    carry_to_sample(imu)
+    look_for_rest(imu, ended)
 
 
 def turn_with_gyro(imu):
-    """Follow the gyro to the sample; return whether it ends a step."""
-    imu.time[0] = imu.time[1]
+    """Follow the gyro to the sample, and keep it for the end of the step; return whether it ends it.
+
+    A step ends with the last sample before a multiple of its interval.
+    """
+    a = imu.arrays
+    a.times[0], a.times[1] = a.clock[0], imu.time[0]
     for i in range(3):
-        imu.rate[0, i] = imu.rate[1, i]
+        a.rates[0, i], a.rates[1, i] = a.rate[i], imu.gyro[0, i]
     for i in range(4):
-        imu.turned[0, i] = imu.turned[1, i]
-    write_sample(imu, 1)
-    call(imu.follow.address, imu.follow.arguments, ())
-    m = imu.edge[1] + 1
-    imu.edge[1] = m
+        a.turns[0, i] = a.turned[i]
+    call(imu.routines.follow.address, imu.routines.follow.arguments, ())
+    before = math.floor((a.clock[0] + imu.interval - a.clock[2]) / imu.step + 1e-6)
+    n = a.count[1] + 1
+    a.count[1] = n
+    a.clock[0] = imu.time[0]
     for i in range(3):
-        imu.force[m, i] = imu.filter.call[FIRST + i]
-        imu.field[m, i] = imu.filter.call[FIELD + i]
+        a.rate[i] = imu.gyro[0, i]
+        a.force[n, i] = imu.accelerometer[0, i]
+        if imu.magnetometer > 0:
+            a.field[n, i] = imu.magnetic[0, i]
     for i in range(4):
-        imu.frame[m, i] = imu.turned[1, i]
-    before = math.floor((imu.time[0] + imu.interval - imu.start[0]) / imu.step + 1e-6)
-    return math.floor((imu.time[1] + imu.interval - imu.start[0]) / imu.step + 1e-6) != before
+        a.turned[i] = a.turns[1, i]
+        a.frame[n, i] = a.turns[1, i]
+    return math.floor((imu.time[0] + imu.interval - a.clock[2]) / imu.step + 1e-6) != before
 
 
 def end_step(imu):
-    """Filter the step, and update the level of the field's disturbance."""
-    live = imu.filter
-    call(imu.average.address, imu.average.arguments, ())
-    call(imu.end.address, imu.end.arguments, ())
-    number = imu.number[0]
-    count = 0
+    """Filter a step: its rotation, the mean of its specific force, and a heading that ends with it."""
+    a, routines = imu.arrays, imu.routines
+    a.edge[0], a.edge[1] = 0, a.count[1]
+    call(routines.average.address, routines.average.arguments, ())
+    call(routines.end.address, routines.end.arguments, ())
+    predict_filter(imu, a.turn)
+    number = a.number[0]
     if number > 0.0:
-        count = 1
-        length = live.declared[0, LENGTH]
-        for i in range(ROW):
-            live.rows[0, i] = live.declared[0, i]
-        live.rows[0, TIME] = imu.time[1]
-        live.rows[0, SIGMA] = imu.noise / math.sqrt(number * imu.interval) / length
-        for i in range(3):
-            live.rows[0, VALUE + i] = imu.mean[0, i] / length
-    heading = False
+        update_filter(imu, 0, a.mean, imu.noise / math.sqrt(number * imu.interval))
     if imu.magnetometer > 0:
-        heading = read_heading(imu)
-        if heading:
-            write_heading(imu, count)
-            count += 1
-    for i in range(3):
-        live.increment[i] = imu.turn[0, i]
-    code = process(live, imu.time[1], count, 1)
-    if code < 0:
-        return code
-    if heading:
-        innovation = live.innovation[count - 1, 0]
-        nis = innovation * innovation / live.innovation[count - 1, 1]
-        imu.field_nis[0] = nis if abs(nis) < math.inf else 0.0
-        call(imu.field_mean.address, imu.field_mean.arguments, ())
-    imu.iron[0] = imu.iron_variance[0]
+        end_field(imu)
     begin_step(imu)
-    show_step(imu)
-    return 0
 
 
-def show_step(imu):
-    """Write the state of the filter, and the scale of its tilt, for the stamps up to the next step."""
+def end_field(imu):
+    """Process the field of a step; update with a heading that ends with it, and update the level of the field's disturbance."""
+    a, routines = imu.arrays, imu.routines
+    call(routines.average_field.address, routines.average_field.arguments, ())
+    middle = (a.edge[1] + 1) // 2
+    for i in range(4):
+        a.middle[0, i], a.end[0, i] = a.frame[middle, i], a.turned[i]
+    a.length[0] = a.field_number[0] * imu.interval
+    a.now[0] = a.clock[0]
+    a.turn_variance[0] = 0.0
+    call(routines.head.address, routines.head.arguments, ())
+    if a.found_sigma[0] > 0.0:
+        a.nis[0] = update_filter(imu, 1, a.found_direction, a.found_sigma[0])
+        call(routines.field_mean.address, routines.field_mean.arguments, ())
+    a.iron_variance[0] = a.found_variance[0]
+
+
+def begin_step(imu):
+    """Begin a step at the last sample, with the scales of the reported σ."""
+    a = imu.arrays
+    a.count[1] = 0
+    a.clock[1] = a.clock[0]
+    for i in range(4):
+        a.frame[0, i] = a.turned[i]
+    show_filter(imu)
+    call(imu.routines.scale.address, imu.routines.scale.arguments, ())
+
+
+def carry_to_sample(imu):
+    """Propagate the estimate from the start of the step to the last sample, and over its delay."""
+    a = imu.arrays
+    a.times[0], a.times[1] = a.clock[1], a.clock[0]
+    for row in range(2):
+        for i in range(3):
+            a.rates[row, i] = a.rate[i]
+            a.ahead[row, i] = a.rate[i] * imu.late
+    for i in range(4):
+        a.turns[0, i], a.turns[1, i] = a.frame[0, i], a.turned[i]
+    call(imu.routines.carry.address, imu.routines.carry.arguments, ())
+
+
+def look_for_rest(imu, ended):
+    """Look for rest; one that shows the bias corrects it with the end of the step."""
+    if imu.rests > 0:
+        call(imu.routines.watch.address, imu.routines.watch.arguments, ())
+        if ended and imu.resting[1] == 1:
+            imu.resting[1] = 2
+
+
+# -------------------------------------------------------------------------------------- the filter, which the exported one has of its own
+
+
+def predict_filter(imu, turn):
+    """Propagate the filter over the rotation of a step."""
+    for i in range(3):
+        imu.filter.increment[i] = turn[0, i]
+    code = process(imu.filter, imu.arrays.clock[0], 0, 1)
+    if code < 0:
+        imu.refused[0] = code
+
+
+def update_filter(imu, sensor, vector, sigma):
+    """Update the filter with a vector of a sensor; return the NIS of a heading, 0 if it was not used."""
+    live = imu.filter
+    length = live.declared[sensor, LENGTH]
+    for i in range(ROW):
+        live.rows[0, i] = live.declared[sensor, i]
+    live.rows[0, TIME], live.rows[0, SIGMA] = imu.arrays.clock[0], sigma / length
+    for i in range(3):
+        live.rows[0, VALUE + i] = vector[0, i] / length
+    code = process(live, imu.arrays.clock[0], 1, 0)
+    if code < 0:
+        imu.refused[0] = code
+    nis = live.innovation[0, 0] * live.innovation[0, 0] / live.innovation[0, 1]
+    return nis if abs(nis) < math.inf else 0.0
+
+
+def show_filter(imu):
+    """Copy the state of the filter for the samples up to the next step."""
     for i in range(4):
         imu.attitude[0, i] = imu.state[i]
     for i in range(3):
@@ -274,27 +348,3 @@ def show_step(imu):
         for j in range(6):
             imu.covariance[0, i, j] = imu.numbers[imu.places[i, j]]
         imu.variance[0, i] = imu.covariance[0, i, i]
-    call(imu.scale.address, imu.scale.arguments, ())
-
-
-def read_heading(imu):
-    """Process the field of the step; return whether a heading ends with it."""
-    m = imu.edge[1]
-    call(imu.average_field.address, imu.average_field.arguments, ())
-    for i in range(4):
-        imu.head_frame[0, i] = imu.frame[(m + 1) // 2, i]
-        imu.head_end[0, i] = imu.frame[m, i]
-    imu.head_length[0] = imu.field_number[0] * imu.interval
-    imu.head_time[0] = imu.time[1]
-    call(imu.head.address, imu.head.arguments, ())
-    return imu.sigma[0] > 0.0
-
-
-def write_heading(imu, row):
-    """Write the heading to a row of the filter's measurements."""
-    rows = imu.filter.rows
-    for i in range(ROW):
-        rows[row, i] = imu.filter.declared[1, i]
-    rows[row, TIME], rows[row, SIGMA] = imu.time[1], imu.sigma[0]
-    for i in range(3):
-        rows[row, VALUE + i] = imu.direction[0, i]

@@ -24,29 +24,6 @@ def block_statistics(samples, length, mean, square):
             square[k] += dot(off, off)
 
 
-def halves(samples, sums, number):
-    """Write the sums of the first and of the second half of the samples of each span (k, 2, 3), and their number (k,).
-
-    ``samples``: (k, length, 3), not finite if missing. Of an odd number the first half has one more.
-    """
-    for k in range(len(samples)):
-        count = 0
-        for i in range(samples.shape[1]):
-            if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
-                count += 1
-        number[k] = count
-        count_below = 0
-        for half in range(2):
-            for c in range(3):
-                sums[k, half, c] = 0.0
-        for i in range(samples.shape[1]):
-            if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
-                count_below += 1
-                half = 0 if 2 * count_below <= count + 1 else 1
-                for c in range(3):
-                    sums[k, half, c] += samples[k, i, c]
-
-
 def longest_runs(samples, run):
     """Write the first and the last row of the longest run of equal samples about each axis (3, 2); of several the first one."""
     for c in range(3):

@@ -1,0 +1,160 @@
+"""Rests of a unit, sample by sample: its mean rate over a second in which it hardly moves is a measurement of the gyro's bias.
+
+All that lasts from one sample to the next is in arrays, so samples may be processed at once or one at a time, with the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import combine, cross, dot
+from strapdown.kernels.measurement import vector_at
+from strapdown.kernels.state import store_row
+
+
+class Constants(NamedTuple):
+    """Constants of the method, and of a unit."""
+
+    parts: int
+    """Number of parts of a span, whose mean rates are compared."""
+    part: int
+    """Number of samples of a part."""
+    span: float
+    """Usual duration of a span, s."""
+    own_variance: float
+    """Variance of the mean rate of a unit that does not move, (rad/s)²."""
+    max_variance: float
+    """Variance of the mean rate from which on the unit moves, (rad/s)²."""
+    turning: float
+    """Squared mean rate, (rad/s)², above which vertical and field are examined for a rotation with it."""
+    walk: float
+    """Variance that the bias gains in a second."""
+
+
+class Memory(NamedTuple):
+    """What lasts from one sample to the next."""
+
+    tenths: np.ndarray
+    """Sums of the rate over the parts of the span (parts, 3)."""
+    halves: np.ndarray
+    """Sums of specific force and field over its halves (4, 3)."""
+    halves_number: np.ndarray
+    """Number of samples in them (4,)."""
+    resting: np.ndarray
+    """Number of samples in the span; 1 if a rest was found that shows more of the bias than is known (2,)."""
+    rest_rate: np.ndarray
+    """Mean rate of the last span (1, 3), rad/s."""
+    rest_variance: np.ndarray
+    """Its variance, infinite if it was no rest, and that of the bias by all rests (2,)."""
+    rest_clock: np.ndarray
+    """Time of the first sample of the span, and of the last rest, s (2,)."""
+
+
+class Means(NamedTuple):
+    """Results for each span that ended."""
+
+    rate: np.ndarray
+    """Mean rate (k, 3), rad/s."""
+    variance: np.ndarray
+    """Its variance (k,); infinite if it was no rest."""
+
+
+def find_rests(constants, time, rate, force, field, memory, means):
+    """Look for rests in samples (n,), (n, 3); ``field`` (0, 3) if there is none. Missing ones are not finite or zero."""
+    length = constants.parts * constants.part
+    for i in range(len(time)):
+        k = memory.resting[0]
+        if k == 0:
+            memory.rest_clock[0] = time[i]
+        add(memory.tenths, k // constants.part, vector_at(rate, i))
+        half = k // ((length + 1) // 2)
+        add_known(memory, half, vector_at(force, i))
+        if len(field) > 0:
+            add_known(memory, 2 + half, vector_at(field, i))
+        memory.resting[0] = k + 1
+        if k + 1 == length:
+            find_rest(constants, time[i], memory)
+            clear_span(memory)
+            store_row(means.rate, i // length, vector_at(memory.rest_rate, 0))
+            means.variance[i // length] = memory.rest_variance[0]
+
+
+def add(sums, row, vector):
+    """Add a vector to a row of sums."""
+    for i in range(3):
+        sums[row, i] += vector[i]
+
+
+def add_known(memory, row, vector):
+    """Add a sample of specific force or field to the sums over a half of the span, unless it is missing."""
+    if 0.0 < dot(vector, vector) < math.inf:
+        memory.halves_number[row] += 1
+        add(memory.halves, row, vector)
+
+
+def clear_span(memory):
+    """Begin another span."""
+    memory.resting[0] = 0
+    for i in range(4):
+        memory.halves_number[i] = 0
+    for sums in (memory.tenths, memory.halves):
+        for i in range(len(sums)):
+            for j in range(3):
+                sums[i, j] = 0.0
+
+
+def find_rest(constants, time, memory):
+    """Decide at the end of a span whether it was a rest.
+
+    The variance of its mean rate is that of a unit at rest and the spread of the rate between the parts, which is motion of the hand. A
+    span with a gap is no rest, nor one with which the vertical or the field rotates: a steady turn is no bias.
+    """
+    parts, part = constants.parts, constants.part
+    rate = (0.0, 0.0, 0.0)
+    for i in range(parts):
+        rate = combine(1.0, rate, 1.0 / part, vector_at(memory.tenths, i))
+    rate = (rate[0] / parts, rate[1] / parts, rate[2] / parts)
+    spread = 0.0
+    for i in range(parts):
+        off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
+        spread += dot(off, off)
+    variance = constants.own_variance + spread / parts
+    with_force, square_force = turned_with(constants, rate, memory, 0)
+    with_field, square_field = turned_with(constants, rate, memory, 2)
+    still = (
+        variance < constants.max_variance
+        and time - memory.rest_clock[0] < 1.5 * constants.span
+        and memory.halves_number[0] + memory.halves_number[1] > parts * part // 2
+        and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
+    )
+    store_row(memory.rest_rate, 0, rate)
+    memory.rest_variance[0] = variance if still else math.inf
+    drifted = memory.rest_variance[1] + constants.walk * (time - memory.rest_clock[1])
+    if still and variance < drifted:
+        memory.resting[1] = 1
+        memory.rest_clock[1] = time
+        memory.rest_variance[1] = combined(drifted, variance)
+
+
+def combined(variance, other):
+    """Return the variance of the mean of two measurements, weighted by their information."""
+    return 1.0 / (1.0 / variance + 1.0 / other)
+
+
+def turned_with(constants, rate, memory, first):
+    """Return c·w and w·w of the change c of a direction from the first to the second half, and that, w, by the mean rate."""
+    sums, number = memory.halves, memory.halves_number
+    in_first, in_second = number[first], number[first + 1]
+    total = combine(1.0, vector_at(sums, first), 1.0, vector_at(sums, first + 1))
+    size = math.sqrt(dot(total, total)) / max(in_first + in_second, 1)
+    product, square = 0.0, 0.0
+    if in_first > 0 and in_second > 0 and size > 0.0:
+        before, after = 1.0 / (size * in_first), 1.0 / (size * in_second)
+        change = combine(after, vector_at(sums, first + 1), -before, vector_at(sums, first))
+        middle = combine(before, vector_at(sums, first), after, vector_at(sums, first + 1))
+        expected = cross(rate, combine(-0.25 * constants.span, middle, 0.0, middle))
+        product, square = dot(change, expected), dot(expected, expected)
+    return product, square
