@@ -74,7 +74,9 @@ class AhrsParameters:
         σ of a constant bias of the accelerometer, each component, m/s²; 0: no states. The smoother replaces it by the difference between
         the specific force at rest and gravity if that is larger than 0.1 m/s².
     tilt_sigma : float, default 0.0
-        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
+        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated. The filter's
+        has in addition the deviation of the specific force from gravity in slow motion so far (:mod:`strapdown.ahrs.regions`), the
+        smoother's the difference between its tilt and its filter's.
     tilt_by_field, max_tilt_by_field : float, default 0.0
         σ of a further such error, m/s², where the field is disturbed as along the path of a phone indoors
         (:mod:`strapdown.ahrs.regions`), and its maximum in fields that are disturbed more: the units that are carried so are those of
@@ -201,9 +203,9 @@ HAND_HELD_SMOOTHED = replace(
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
+    tilt_sigma=0.054,
     tilt_by_field=0.08,
     max_tilt_by_field=0.165,
-    tilt_share=0.04,
     heading_by_field=0.95,
     gyro_scale_sigma=4e-3,
 )
@@ -219,6 +221,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     velocity_time=1.0,
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
+    tilt_sigma=0.045,
     tilt_share=0.2,
     gyro_scale_sigma=5e-3,
 )

@@ -1,8 +1,9 @@
-"""The reported covariance: the filter's own, scaled by what the recording shows so far of the field.
+"""The reported covariance: the filter's own, scaled by what the recording shows so far of the field and of the accelerometer.
 
 One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. Its
-innovations show how far a recording differs from it. The scales were chosen so that the 95 % regions hold on the development halves of
-eight sets (``benchmarks/recordings.py``); the estimate does not depend on them. Scales below 1 apply to the variance of a settled filter.
+innovations show how far a recording differs from it, and the specific force in slow motion how far the accelerometer errs. The scales were
+chosen so that the 95 % regions hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend
+on them. Scales below 1 apply to the variance of a settled filter.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ LEVEL_TIME = 5.0
 """Time constant of the average that gives the level of the acceleration, s; by it the innovations' variance is scaled."""
 OWN_SHARE = 0.1
 """Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
-DISAGREEMENT_SHARE = 1.5
+DISAGREEMENT_SHARE = 1.0
 """Variance added to that of the smoothed tilt, relative to the mean square difference between filtered and smoothed tilt."""
 USUAL_DISAGREEMENT = 0.15 * DEGREE
 """Difference, rad, that a filter and a smoother whose model is right have too."""
@@ -77,16 +78,17 @@ def scales(
 ) -> tuple[Array, Array, Array]:
     """Return the factor on σ of the tilt, the variance that is added to it, rad², and the factor on σ of the heading (k + 1,) each.
 
-    From the measurements before each step or, if there is a ``disagreement``, from all: the mean square difference, rad², between the
-    smoother's tilt about one axis and its filter's (:func:`disagreement`). Errors of the model that last longer than σ allows show there.
-    ``deviation`` (k + 1,): mean square deviation of the specific force from gravity up to each step (:func:`gravity_deviation`), (m/s²)².
+    From the measurements before each step, and the ``deviation`` (k + 1,) of the specific force from gravity, which shows the
+    accelerometer's errors (:func:`gravity_deviation`). If there is a ``disagreement``, from all measurements, and instead of the deviation
+    the mean square difference, rad², between the smoother's tilt about one axis and its filter's (:func:`disagreement`): errors that last
+    longer than σ allows, of the accelerometer and of the model, show there.
     """
     field = field_level(filtered, parameters, causal=disagreement is None)
     shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
     if disagreement is not None:
-        added = DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0) * STANDARD_GRAVITY**2
-        shares = shares._replace(max_heading=np.inf, tilt_variance=shares.tilt_variance + added)
-        deviation = np.full(len(field), deviation[-1])
+        unusual = DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0)
+        deviation = np.full(len(field), unusual * STANDARD_GRAVITY**2)
+        shares = shares._replace(max_heading=np.inf)
     tilt, floor, heading = np.empty((3, len(field)))
     compiled(recording_steps.scale_factors)(read_only(field), read_only(deviation), shares, tilt, floor, heading)
     return tilt, floor, heading
