@@ -16,6 +16,8 @@ from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import setup
 from strapdown.kernels import headings as kernels
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.units import DEGREE
@@ -882,8 +884,9 @@ def by_share(variance, share, limit):
 
 
 @pytest.mark.parametrize("heading_share", [1.0, 0.05, 2.0])
-def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share):
+def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share, monkeypatch):
     """The filter's covariance in fixed axes, along the principal axes of the tilt and about the vertical."""
+    monkeypatch.setattr(regions, "MAX_DEVIATION", 0.0)
     unit = dataclasses.replace(
         ahrs.HAND_HELD,
         iron_sigma=0.0,
@@ -1063,6 +1066,56 @@ def test_disagreement_of_filter_and_smoother_widens_the_tilt_alone(monkeypatch):
     np.testing.assert_allclose(added[:, :2], expected, rtol=1e-6)
     assert expected > (0.5 * DEGREE) ** 2
     assert np.abs(added[:, 2]).max() < 1e-9 * expected
+
+
+def test_the_deviation_from_gravity_in_slow_motion_is_that_of_a_plain_sum():
+    """Forces that change more and more slowly, some missing; each mean with all its weights at once."""
+    steps, step = 400, 0.03
+    random = np.random.default_rng(8)
+    change = np.exp(-np.arange(steps) / 60.0)[:, None] * random.standard_normal((steps, 3))
+    force = np.array([0.1, -0.2, 9.95]) + 4.0 * change
+    number = random.integers(0, 4, steps).astype(float)
+    deviation = regions.gravity_deviation(force * number[:, None], number, step)
+    total, weights, expected = 0.0, 0.0, [0.0]
+    for k in range(steps):
+        if number[k] > 0.0:
+            known = np.flatnonzero(number[: k + 1] > 0.0)
+            share = np.exp(-step * np.arange(len(known))[::-1])
+            mean = np.average(force[known], axis=0, weights=share)
+            variance = np.average(np.sum((force[known] - mean) ** 2, axis=1), weights=share)
+            weight = 1.0 / (1.0 + variance / 0.3**2) ** 2
+            total += weight * min(np.linalg.norm(mean) - 9.80665, 1.0) ** 2
+            weights += weight
+        expected.append(total / (15.0 / step + weights))
+    np.testing.assert_allclose(deviation, expected, rtol=1e-9)
+
+
+def test_an_accelerometer_that_deviates_from_gravity_has_a_less_certain_tilt():
+    """In closed form: half of the mean square deviation after 15 s in slow motion, here a rotation in place."""
+    plain, deviating = (
+        dataclasses.replace(slow := recording(30.0), specific_force=slow.specific_force * factor)
+        for factor in (9.80665 / 9.81, 1.05 * 9.80665 / 9.81)
+    )
+    tilts = []
+    for one in (plain, deviating):
+        result = ahrs.estimate(one, latency=0.0, full_covariance=True)
+        R = quaternion.to_matrix(result.estimate.attitude)
+        P = R @ result.estimate.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+        tilts.append(P[:, 0, 0] + P[:, 1, 1])
+    row = np.searchsorted(plain.time, plain.time[0] + 20.0)
+    expected = 2.0 * 0.05**2 * 20.0 / (15.0 + 20.0)
+    assert tilts[1][row] - tilts[0][row] == pytest.approx(expected, rel=0.02)
+
+
+def test_the_headings_variance_follows_the_fields_level():
+    """In closed form: x^(5/4) of the level relative to that along a phone's path, up to a limit."""
+    unit = dataclasses.replace(ahrs.HAND_HELD, heading_share=0.2, heading_by_field=0.5)
+    level = np.array([0.0, 1e-3, 0.02, 0.1, 50.0])
+    out = np.empty((3, len(level)))
+    shares = regions.shares_of(unit, magnetometer=True)
+    compiled(recording_steps.scale_factors)(read_only(level), read_only(np.zeros(len(level))), shares, *out)
+    expected = np.sqrt(np.minimum(0.2 + 0.5 * (level / 0.02) ** 1.25, 38.0))
+    np.testing.assert_allclose(out[2], expected, rtol=1e-14)
 
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):

@@ -157,7 +157,7 @@ def estimate(
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
     filtered, disagreement = _run(prepared, parameters, faults.turn_variance, at_rest, options)
-    scales = regions.scales(filtered, parameters, disagreement=disagreement)
+    scales = regions.scales(filtered, prepared.deviation, parameters, disagreement=disagreement)
     at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(

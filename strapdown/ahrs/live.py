@@ -146,8 +146,16 @@ class LiveAhrs:
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
             end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
+            compare=(
+                r(a.total),
+                r(a.number),
+                regions.slow_motion(max(parameters.step, self.interval)),
+                a.force_sums,
+                a.force_deviation,
+            ),
             scale=(
                 r(a.field_level),
+                r(a.force_deviation),
                 regions.shares_of(parameters, magnetometer=magnetometer),
                 a.tilt,
                 a.floor,

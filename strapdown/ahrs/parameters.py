@@ -74,7 +74,9 @@ class AhrsParameters:
         σ of a constant bias of the accelerometer, each component, m/s²; 0: no states. The smoother replaces it by the difference between
         the specific force at rest and gravity if that is larger than 0.1 m/s².
     tilt_sigma : float, default 0.0
-        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
+        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated. The filter's
+        has in addition the deviation of the specific force from gravity in slow motion so far (:mod:`strapdown.ahrs.regions`), the
+        smoother's the difference between its tilt and its filter's.
     tilt_by_field, max_tilt_by_field : float, default 0.0
         σ of a further such error, m/s², where the field is disturbed as along the path of a phone indoors
         (:mod:`strapdown.ahrs.regions`), and its maximum in fields that are disturbed more: the units that are carried so are those of
@@ -183,12 +185,12 @@ HAND_HELD = AhrsParameters(
     velocity_sigma=0.7,
     acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_sigma=0.054,
-    tilt_by_field=0.3,
-    max_tilt_by_field=0.36,
-    tilt_share=0.08,
-    heading_share=0.05,
-    heading_by_field=1.1,
+    tilt_sigma=0.042,
+    tilt_by_field=0.25,
+    max_tilt_by_field=0.38,
+    tilt_share=0.05,
+    heading_share=0.03,
+    heading_by_field=0.65,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
@@ -201,11 +203,10 @@ HAND_HELD_SMOOTHED = replace(
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
+    tilt_sigma=0.054,
     tilt_by_field=0.08,
     max_tilt_by_field=0.165,
-    tilt_share=0.07,
-    heading_share=0.1,
-    heading_by_field=0.9,
+    heading_by_field=0.95,
     gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
@@ -221,7 +222,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
     tilt_sigma=0.045,
-    tilt_share=0.15,
+    tilt_share=0.2,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the

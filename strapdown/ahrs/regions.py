@@ -1,12 +1,14 @@
-"""The reported covariance: the filter's own, scaled by what the recording shows so far of the field.
+"""The reported covariance: the filter's own, scaled by what the recording shows so far of the field and of the accelerometer.
 
 One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. Its
-innovations show how far a recording differs from it. The scales were chosen so that the 95 % regions hold on the development halves of
-eight sets (``benchmarks/recordings.py``); the estimate does not depend on them. Scales below 1 apply to the variance of a settled filter.
+innovations show how far a recording differs from it, and the specific force in slow motion how far the accelerometer errs. The scales were
+chosen so that the 95 % regions hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend
+on them. Scales below 1 apply to the variance of a settled filter.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +27,7 @@ LEVEL_TIME = 5.0
 """Time constant of the average that gives the level of the acceleration, s; by it the innovations' variance is scaled."""
 OWN_SHARE = 0.1
 """Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
-DISAGREEMENT_SHARE = 0.8
+DISAGREEMENT_SHARE = 1.0
 """Variance added to that of the smoothed tilt, relative to the mean square difference between filtered and smoothed tilt."""
 USUAL_DISAGREEMENT = 0.15 * DEGREE
 """Difference, rad, that a filter and a smoother whose model is right have too."""
@@ -37,6 +39,14 @@ FIRST_LEVEL = (0.01, 15.0)
 """Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
 FIELD_MEMORY = 60.0
 """Time constant with which that mean forgets, s."""
+SLOW_TIME = 1.0
+"""Time constant of the mean specific force whose magnitude is compared with gravity, s."""
+SLOW_CHANGE = 0.3
+"""Standard deviation of the force within that time, m/s², at which the comparison counts a quarter."""
+MAX_DEVIATION = 1.0
+"""Maximum deviation from gravity that is an error of an accelerometer, m/s²."""
+DEVIATION_TIME = 15.0
+"""Time in slow motion, s, after which half of the mean square deviation is reported."""
 
 
 def acceleration_level(filtered: Estimate, uncertain: np.ndarray, interval: float) -> Array:
@@ -64,20 +74,23 @@ def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovation
 
 
 def scales(
-    filtered: Estimate, parameters: AhrsParameters, *, disagreement: float | None = None
+    filtered: Estimate, deviation: Array, parameters: AhrsParameters, *, disagreement: float | None = None
 ) -> tuple[Array, Array, Array]:
     """Return the factor on σ of the tilt, the variance that is added to it, rad², and the factor on σ of the heading (k + 1,) each.
 
-    From the measurements before each step or, if there is a ``disagreement``, from all: the mean square difference, rad², between the
-    smoother's tilt about one axis and its filter's (:func:`disagreement`). Errors of the model that last longer than σ allows show there.
+    From the measurements before each step, and the ``deviation`` (k + 1,) of the specific force from gravity, which shows the
+    accelerometer's errors (:func:`gravity_deviation`). If there is a ``disagreement``, from all measurements, and instead of the deviation
+    the mean square difference, rad², between the smoother's tilt about one axis and its filter's (:func:`disagreement`): errors that last
+    longer than σ allows, of the accelerometer and of the model, show there.
     """
     field = field_level(filtered, parameters, causal=disagreement is None)
     shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
     if disagreement is not None:
-        added = DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0) * STANDARD_GRAVITY**2
-        shares = shares._replace(max_heading=np.inf, tilt_variance=shares.tilt_variance + added)
+        unusual = DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0)
+        deviation = np.full(len(field), unusual * STANDARD_GRAVITY**2)
+        shares = shares._replace(max_heading=np.inf)
     tilt, floor, heading = np.empty((3, len(field)))
-    compiled(recording_steps.scale_factors)(read_only(field), shares, tilt, floor, heading)
+    compiled(recording_steps.scale_factors)(read_only(field), read_only(deviation), shares, tilt, floor, heading)
     return tilt, floor, heading
 
 
@@ -94,6 +107,30 @@ def shares_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_st
         field_level=FIELD_LEVEL,
         gravity=STANDARD_GRAVITY,
     )
+
+
+def slow_motion(step: float) -> recording_steps.SlowMotion:
+    """Return the constants of the comparison with gravity over steps of an interval, s."""
+    return recording_steps.SlowMotion(
+        gravity=STANDARD_GRAVITY,
+        share=-math.expm1(-step / SLOW_TIME),
+        quiet_variance=SLOW_CHANGE**2,
+        max_square=MAX_DEVIATION**2,
+        steps=DEVIATION_TIME / step,
+    )
+
+
+def gravity_deviation(total: Array, number: Array, step: float) -> Array:
+    """Return the mean square deviation of the specific force from gravity up to each edge of the steps (k + 1,), (m/s²)².
+
+    It is that of the accelerometer's error along the vertical, by which its horizontal error, and thus the tilt's, is judged. ``total``
+    (k, 3), ``number`` (k,): sums of each step's samples, in axes that do not rotate. ``step``: interval of the steps, s.
+    """
+    deviation = np.zeros(len(total) + 1)
+    compiled(recording_steps.gravity_deviation)(
+        read_only(total), read_only(number), slow_motion(step), np.zeros(7), deviation[1:]
+    )
+    return deviation
 
 
 def limits(parameters: AhrsParameters, delay_sigma: float) -> recording_steps.Limits:

@@ -169,6 +169,9 @@ def init(f: Any) -> Any:
     for i in range(6):
         f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
+    for array in (f.force_deviation, f.force_sums):
+        for i in range(len(array)):
+            array[i] = 0
     if r.magnetometer:
         for array in (f.counted, f.sums, f.iron, f.total, f.start):
             for i in range(len(array)):

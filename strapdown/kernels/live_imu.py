@@ -19,6 +19,7 @@ from strapdown.kernels.recording_steps import (
     carry_to_stamps,
     end_steps,
     follow_gyro,
+    gravity_deviation,
     running_mean,
     scale_factors,
 )
@@ -38,6 +39,8 @@ LASTING = {
     "turned": ((4,), "", "attitude by the gyro alone, since the start"),
     "force": ((MOST, 3), "", "specific force at the samples of this step"),
     "frame": ((MOST, 4), "", "attitude by the gyro at its start and at its samples"),
+    "force_deviation": ((1,), "", "mean square deviation of the specific force from gravity in slow motion, (m/s^2)^2"),
+    "force_sums": ((7,), "", "its sums"),
     "tilt": ((1,), "", "factor on sigma of the tilt"),
     "floor": ((1,), "", "variance that is added to that of the tilt, rad^2"),
     "heading": ((1,), "", "factor on sigma of the heading"),
@@ -92,6 +95,7 @@ class Routines(NamedTuple):
     follow: Any
     average: Any
     end: Any
+    compare: Any
     scale: Any
     carry: Any
     average_field: Any
@@ -104,6 +108,7 @@ KERNELS = Routines(
     follow=follow_gyro,
     average=average_samples,
     end=end_steps,
+    compare=gravity_deviation,
     scale=scale_factors,
     carry=carry_to_stamps,
     average_field=average_samples,
@@ -252,6 +257,7 @@ def end_step(imu):
     a.edge[0], a.edge[1] = 0, a.count[1]
     call(routines.average.address, routines.average.arguments, ())
     call(routines.end.address, routines.end.arguments, ())
+    call(routines.compare.address, routines.compare.arguments, ())
     predict_filter(imu, a.turn)
     number = a.number[0]
     if number > 0.0:

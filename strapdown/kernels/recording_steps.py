@@ -278,14 +278,60 @@ class Shares(NamedTuple):
     gravity: float
 
 
-def scale_factors(field_level, shares, tilt, floor, heading):
-    """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each."""
+def scale_factors(field_level, deviation, shares, tilt, floor, heading):
+    """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each.
+
+    ``deviation`` (k,): mean square deviation of the specific force from gravity (:func:`gravity_deviation`), (m/s²)².
+    """
     for i in range(len(field_level)):
         field = field_level[i] / shares.field_level
         by_field = min(shares.tilt_by_field * field, shares.max_tilt_by_field)
+        variance = shares.tilt_variance + deviation[i] + by_field * by_field
         tilt[i] = math.sqrt(shares.tilt)
-        floor[i] = (shares.tilt_variance + by_field * by_field) / (shares.gravity * shares.gravity)
-        heading[i] = math.sqrt(min(shares.heading + shares.heading_by_field * field, shares.max_heading))
+        floor[i] = variance / (shares.gravity * shares.gravity)
+        scaled = shares.heading_by_field * (field * math.sqrt(math.sqrt(field)))
+        heading[i] = math.sqrt(min(shares.heading + scaled, shares.max_heading))
+
+
+class SlowMotion(NamedTuple):
+    """Constants of the deviation of the specific force from gravity in slow motion."""
+
+    gravity: float
+    share: float
+    """Weight of a step in the mean force of the last second."""
+    quiet_variance: float
+    """Variance of the force within that second, (m/s²)², at which its deviation counts a quarter."""
+    max_square: float
+    """Maximum square deviation, (m/s²)²."""
+    steps: float
+    """Steps in slow motion at which half of the mean square deviation is reported."""
+
+
+def gravity_deviation(total, number, constants, memory, deviation):
+    """Write the mean square deviation (k,) of the specific force from gravity in the motion up to each step, (m/s²)².
+
+    ``total`` (k, 3): sum of each step's samples, in axes that do not rotate, and their ``number`` (k,). The mean force of a second in which
+    the force hardly changes is that of a unit that moves slowly: its magnitude differs from gravity by the accelerometer's error along
+    the vertical. ``memory`` (7,): sum, with exponential forgetting, of the forces, of their squares, and of the weights; sum of the
+    weighted square deviations and of their weights.
+    """
+    for i in range(len(total)):
+        if number[i] > 0.0:
+            x, y, z = total[i, 0] / number[i], total[i, 1] / number[i], total[i, 2] / number[i]
+            kept = 1.0 - constants.share
+            memory[0] = kept * memory[0] + x
+            memory[1] = kept * memory[1] + y
+            memory[2] = kept * memory[2] + z
+            memory[3] = kept * memory[3] + (x * x + y * y + z * z)
+            memory[4] = kept * memory[4] + 1.0
+            x, y, z = memory[0] / memory[4], memory[1] / memory[4], memory[2] / memory[4]
+            square = x * x + y * y + z * z
+            change = max(memory[3] / memory[4] - square, 0.0) / constants.quiet_variance
+            error = math.sqrt(square) - constants.gravity
+            weight = 1.0 / ((1.0 + change) * (1.0 + change))
+            memory[5] += weight * min(error * error, constants.max_square)
+            memory[6] += weight
+        deviation[i] = memory[5] / (constants.steps + memory[6])
 
 
 def low_pass(values, share, result):
