@@ -422,7 +422,7 @@ def test_integration_reports_samples_that_fill_no_step(there, tmp_path):
     result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
     assert result.exit_code == 0, result.output
     assert "Samples not used at the end, an incomplete step of 4: 3." in result.output
-    assert "contains its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
+    assert "declares its own layout; leave `units=" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
 
 
 def test_want_of_memory_ends_with_one_line(run, monkeypatch):

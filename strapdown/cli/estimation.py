@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError, array, non_negative, one_of
+from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.files import reading, writable, write_json
-
-if TYPE_CHECKING:
-    from strapdown.records import Estimate
-    from strapdown.workflows import Run
+from strapdown.files import write_json
 
 FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml")
 """Files that the command may write to its folder, in addition to figures."""
@@ -42,9 +38,8 @@ class _Shared:
     @property
     def options(self) -> dict[str, Any]:
         """Options of :func:`strapdown.estimate`."""
-        noise = self.gyro and sd.gyro.read_spec(self.gyro)
         plain = {name: getattr(self, name) for name in ("gate", "robust", "smooth", "full_covariance")}
-        return plain | {"noise": noise}
+        return plain | {"noise": self.gyro and sd.gyro.read_spec(self.gyro)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,23 +56,13 @@ class _Specified:
     @property
     def options(self) -> dict[str, Any]:
         """Options of :func:`strapdown.estimate`."""
-        from strapdown.estimation.setup import read_setup
-
-        setup = self.filter_file and read_setup(self.filter_file)
-        states: Any = self.state or self.states
-        return {"setup": setup, "states": states, "initial": self.initial, "every": self.every}
-
-    @property
-    def initial(self) -> Any:
-        """Initial state, as :func:`strapdown.estimate` takes it."""
         if self.attitude is not None and self.from_truth:
             raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
-        if self.attitude is None:
-            return "truth" if self.from_truth else None
-        try:
-            return array("--attitude", [float(part) for part in self.attitude.split(",")], (4,))
-        except ValueError:  # of which InputError is one
-            raise InputError(f"--attitude is {self.attitude!r}; give four numbers w,x,y,z") from None
+        initial: Any = "truth" if self.from_truth else None
+        if self.attitude is not None:
+            initial = ui.numbers("--attitude", self.attitude, "four numbers w,x,y,z", 4)
+        setup = self.filter_file and sd.estimation.setup.read_setup(self.filter_file)
+        return {"setup": setup, "states": self.state or self.states, "initial": initial, "every": self.every}
 
 
 @dataclass(frozen=True)
@@ -105,18 +90,12 @@ class _Recorded:
             return None
         if self.place is None or self.date is None:
             raise InputError("--place and --date go together: the field drifts; give both")
-        try:
-            latitude, longitude, *height = (float(part) for part in self.place.split(","))
-        except ValueError:
-            latitude, longitude, *height = (0.0,) * 4
-        if len(height) > 1:
-            raise InputError(f"--place is {self.place!r}; give LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT")
-        return sd.ahrs.MagneticField.at(latitude, longitude, *height, date=self.date)
+        place = ui.numbers("--place", self.place, "LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT", 2, 3)
+        return sd.ahrs.MagneticField.at(*place, date=self.date)
 
     @property
     def options(self) -> dict[str, Any]:
         """Options of :func:`strapdown.estimate`."""
-        one_of("--motion", self.motion or "hand", sd.ahrs.MOTIONS)
         late = self.latency
         return {
             "motion": self.motion,
@@ -139,8 +118,23 @@ class _Output:
     figures: bool = Option(False, "--figures", help="Draw the estimate, its states and errors; --format does too.")
     form: ui.Format | None = Option(None, "--format", help=ui.FORMAT.help)
 
+    def exports(self, recording: Path, *, changed: bool, simulated: bool) -> dict[Path, dict[str, Any]]:
+        """Return the additional files with the options of their writers; raise an error for those that cannot be written."""
+        wanted = {"sequence": self.euler, "frame": self.frame and self.frame.upper()}
+        wanted = {name: value for name, value in wanted.items() if value is not None}
+        if wanted and not self.to:
+            raise InputError("--euler and --frame go with --to FILE; give the file")
+        exports: dict[Path, dict[str, Any]] = {}
+        for target in self.to or ():
+            ui.check_files(target, name="to")
+            form = sd.recordings.estimate_format(target, wanted, recording=not simulated)
+            # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
+            copied = "source" in form.estimate_options and sd.recordings.format_of(recording) is form and not changed
+            exports[target] = wanted | ({"source": recording} if copied else {})
+        return exports
 
-@ui.command
+
+@ui.command()
 def estimate(
     *,
     recording: Path = Argument(help=f"{RECORDING_HELP}; or a record of `strapdown simulate`."),
@@ -156,110 +150,56 @@ def estimate(
     `strapdown simulate`, the filter matches it.
     """
     from strapdown.workflows.estimating import run as run_filter
+    from strapdown.workflows.estimating import warn_about_conventions
 
     out, form = output.out, output.form or ("png" if output.figures else None)
     names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
-    inputs = (recording, shared.gyro, specified.filter_file, recorded.calibration, recorded.temperature)
-    kind = lambda path: reading.kind(path) == "strapdown estimate"  # noqa: E731
-    ui.check_files(*(out / name for name in names), sources=inputs, own=kind, command="estimate")
-    exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
+    ui.check_files(*(out / name for name in names), own="strapdown estimate")
     simulated = sd.recordings.is_record(recording)
+    exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
     for name in ui.options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
-    options = shared.options | (specified.options if simulated else recorded.options)
-    field = recorded.field
+    options, field = shared.options | (specified.options if simulated else recorded.options), recorded.field
     with ui.progress_bar("reading"):
-        source: Any = sd.read(recording, **layout.options(recording))
+        source: Any = sd.read(recording, **layout.options)
     if not simulated:
         if field is not None and source.magnetic_field is None:
             raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
-        ui.warn_about_conventions(source, recording)
+        warn_about_conventions(source)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = run_filter(source, walks=shared.observability, **options)
+    result = run.estimate if field is None else field.to_true_north(run.estimate)
+    ui.say(*result.remarks)
+    ui.show(result.listing())
+    contents: dict[str, Any] = {}
+    if result.error_states:
+        contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
+    if shared.observability:
+        with ui.progress_bar("observability"):
+            analysis = sd.estimation.setup.observability(run.record, run.setup, run.initial)
+        ui.say(str(analysis))
+        contents["observability.json"] = analysis.summary()
+    if result.truth is not None:
+        accuracy = sd.accuracy(result)
+        ui.show(accuracy.listing())
+        contents["errors.json"] = accuracy.summary()
     if field is not None:
-        run = run._replace(estimate=field.to_true_north(run.estimate))
-    if simulated:
-        vectors = ", ".join(f"{len(series.time)} of {series.sensor}" for series in source.vectors) or "no measurements"
-        length = source.time[-1] - source.time[0]
-        ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
-    ui.say(*run.estimate.remarks)
-    ui.show(run.estimate.listing())
+        compared = field.compared(source, result)
+        ui.say(str(compared))
+        contents["field.json"] = compared.summary()
     figures = (f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf", "svg"))
     for name in (*FILES[1:], *figures, *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
-    contents = _shown(run, observability=shared.observability)
-    if field is not None:
-        compared = field.compared(source, run.estimate)
-        ui.say(str(compared))
-        contents["field.json"] = compared.summary()
-    paths = [sd.write(run.estimate, out / FILES[0])]
+    paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():
         write_json(out / file, {"source": recording.name, **content})
         paths.append(out / file)
     if run.calibration is not None:
         paths.append(out / "calibration.toml")
         sd.calibration.write(run.calibration, paths[-1])
-    for target, how in exports.items():
-        paths.append(sd.write(run.estimate, target, recording=None if simulated else source, **how))
+    paths += [sd.write(result, to, recording=None if simulated else source, **how) for to, how in exports.items()]
     if form is not None:
-        paths += _drawn(out, form, run.estimate, recording.name)
+        paths += sd.plots.draw_estimate(result, out, form, title=recording.name)
     ui.written(*paths)
-    if run.estimate.innovations:
-        ui.say(f"Test the filter with `strapdown check {paths[0]}`.")
-
-
-def _shown(run: Run, *, observability: bool) -> dict[str, Any]:
-    """Print observability and errors of an estimate; return these and its error states as contents of JSON files."""
-    from strapdown.estimation import setup
-
-    contents: dict[str, Any] = {}
-    if run.estimate.error_states:
-        contents["states.json"] = {name: states.summary() for name, states in run.estimate.error_states.items()}
-    if observability:
-        with ui.progress_bar("observability"):
-            analysis = setup.observability(run.record, run.setup, run.initial)
-        ui.say(str(analysis))
-        contents["observability.json"] = analysis.summary()
-    if run.estimate.truth is not None:
-        accuracy = sd.accuracy(run.estimate)
-        ui.show(accuracy.listing())
-        contents["errors.json"] = accuracy.summary()
-    return contents
-
-
-def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, dict[str, Any]]:
-    """Return the additional files of an estimate with the options of their writers; raise an error for those that cannot be written."""
-    from strapdown.records import outputs
-
-    frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
-    if output.euler is not None:
-        outputs.euler([[1.0, 0.0, 0.0, 0.0]], output.euler)
-    wanted = {name: value for name, value in (("sequence", output.euler), ("frame", frame)) if value is not None}
-    if wanted and not output.to:
-        raise InputError("--euler and --frame go with --to FILE; give the file")
-    exports = {}
-    for target in output.to or ():
-        writable("to", target, sources=(recording,))
-        file_format = sd.recordings.estimate_format(target, wanted, recording=not sd.recordings.is_record(recording))
-        exports[target] = dict[str, Any](wanted)
-        # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
-        if (
-            "source" in file_format.estimate_options
-            and sd.recordings.format_of(recording) is file_format
-            and not changed
-        ):
-            exports[target]["source"] = recording
-    return exports
-
-
-def _drawn(out: Path, form: ui.Format, result: Estimate, title: str) -> list[Path]:
-    """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
-    truth = result.truth
-    figures = {out / "estimate": sd.plots.estimate_overview(result, title=title, fixed_frame=result.fixed_frame)}
-    if result.error_states:
-        figures[out / "states"] = sd.plots.states_over_time(result, title=title)
-    if truth is not None and truth.has_bias:
-        figures[out / "errors"] = sd.plots.error_overview(result, truth, title=title)
-    elif truth is not None:
-        figures[out / "errors"] = sd.plots.recording_errors(result, truth.attitude, truth.movement)
-    return sd.plots.save_as(figures, form)
+    if result.innovations:
+        ui.say(f"Test the filter with `strapdown check {out / FILES[0]}`.")

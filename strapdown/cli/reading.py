@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from typer import Option
 
-from strapdown.checks import InputError, one_of
-from strapdown.cli.terminal import options_given
+from strapdown.checks import InputError
+from strapdown.cli import terminal as ui
 
 RECORDING_HELP = (
     "Recording of any format: table (CSV, TSV, Parquet) with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]], ROS bag, ULog, EuRoC folder, "
@@ -34,25 +32,12 @@ class Samples:
     topic: str | None = Option(None, help="Bag or flight log: topic of the inertial unit, if there are several.")
 
     @property
-    def units(self) -> dict[str, str]:
-        """Units given, by quantity."""
-        names = ("gyro", "accelerometer", "magnetometer", "time")
-        return {name: unit for name in names if (unit := getattr(self, f"{name}_unit"))}
-
-    def options(self, path: Path) -> dict[str, Any]:
-        """Return the options of :func:`strapdown.read` that are given; a simulated record takes none of them."""
-        from strapdown import recordings
-
-        names = options_given(self)
-        if recordings.is_record(path):
-            if names:
-                what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
-                own = "contains its units" if names[0].endswith("-unit") else "needs none"
-                raise InputError(f"{names[0]} applies to {what.get(names[0], 'a table')}; the record {path} {own}")
-            return {}
-        columns = recordings.parse_mapping(self.columns) if self.columns else None
-        values = {"units": self.units, "columns": columns, "topic": self.topic}
-        return {name: value for name, value in values.items() if value}
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.read` that are given."""
+        units = {name: getattr(self, f"{name}_unit") for name in ("gyro", "accelerometer", "magnetometer", "time")}
+        columns = ui.by_name("--columns", (self.columns or "").split(","), "ROLE=NAME, as in time=when,gx=gyro_x[dps]")
+        values = {"units": {name: unit for name, unit in units.items() if unit}, "columns": columns}
+        return {name: value for name, value in (values | {"topic": self.topic}).items() if value}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,31 +56,14 @@ class Layout(Samples):
         help="Sensor with inverted sign: accelerometer (if it reads -g upward at rest), magnetometer or gyro; may be repeated.",
     )
 
-    def options(self, path: Path) -> dict[str, Any]:
-        """Return the options of :func:`strapdown.read` that are given; a simulated record takes none of them."""
-        from strapdown import recordings
-
-        options = super().options(path)
-        if self.axes:
-            options["axes"] = _axes(self.axes)
-        if self.invert:
-            options["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in self.invert)
-        return options
-
-
-def _axes(texts: Sequence[str]) -> str | dict[str, str]:
-    """Return the axes of the whole unit, or those of sensors by name."""
-    from strapdown import recordings
-
-    single = {}
-    for text in texts:
-        sensor, equals, axes = text.partition("=")
-        if not equals and len(texts) > 1:
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.read` that are given."""
+        axes: Any = self.axes or []
+        whole = [text for text in axes if "=" not in text]
+        if whole and len(axes) > 1:
             raise InputError(
-                f"--axes {text} applies to the whole unit; give only it, or the axes of each sensor, such as gyro=y,x,-z"
+                f"--axes {whole[0]} applies to the whole unit; give only it, or the axes of each sensor, such as gyro=y,x,-z"
             )
-        recordings.axes_matrix(axes if equals else text, "--axes")
-        if not equals:
-            return text
-        single[one_of("--axes: sensor", sensor, recordings.SENSORS)] = axes
-    return single
+        axes = whole[0] if whole else ui.by_name("--axes", axes, "SENSOR=AXES")
+        return super().options | {name: value for name, value in (("axes", axes), ("invert", self.invert)) if value}

@@ -149,6 +149,13 @@ class Campaign(Listed):
         }
 
     @property
+    def extent(self) -> str:
+        """Numbers of runs, seed and machine, in words."""
+        done = 0 if self.statistics is None else self.statistics.runs
+        number = f"{done} run{'' if done == 1 else 's'}" if self.finished else f"{done} of {self.runs} runs"
+        return f"{number} of {self.plan.scenario.duration:g} s, seed {self.plan.seed}, machine {self.machine}"
+
+    @property
     def finished(self) -> bool:
         """Whether the statistics contain all runs."""
         return self.statistics is not None and self.statistics.runs == self.runs

@@ -281,6 +281,15 @@ def _drift(value: float | None) -> str:
     return f"{value:.4g}" if abs(value) > ROUNDING else "rounding"
 
 
+def words(summary: Mapping[str, Any]) -> str:
+    """Return the cone, the gyro and the runs of a study's :meth:`ConingStudy.summary` in words."""
+    p = summary["scenario"]
+    return (
+        f"Coning of {p['angle_deg']:g}° at {p['frequency_hz']:g} Hz, gyro sampled at {p['rate_hz']:g} Hz ({p['samples_per_cycle']:.3g} "
+        f"samples per cycle); {p['runs']} run{'' if p['runs'] == 1 else 's'} of {p['duration_s']:g} s, seed {p['seed']}"
+    )
+
+
 def tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return the tables of a study's :meth:`ConingStudy.summary`: one's own algorithms, if any, the drifts, and the filter with each.
 

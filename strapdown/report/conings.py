@@ -34,8 +34,7 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter: {', '.join(passing) or 'none'}"
     content = page.page(
         "Coning study",
-        f"cone of {scenario['angle_deg']:g}° at {scenario['frequency_hz']:g} Hz, gyro at {scenario['rate_hz']:g} Hz; "
-        f"{scenario['runs']} runs of {scenario['duration_s']:g} s, seed {scenario['seed']}",
+        coning_study.words(study),
         page.verdict(answer, reason),
         *_charts([row["algorithm"] for row in drifts], sizes, _DRIFT),
         page.listed(drift_table),

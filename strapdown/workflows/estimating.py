@@ -112,7 +112,7 @@ def estimate(
 
     Warns
     -----
-    UserWarning
+    ConventionWarning
         If units, axes or signs of a recording seem wrong.
 
     Examples
@@ -122,8 +122,7 @@ def estimate(
     >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
     """
     options = locals()
-    if isinstance(source, Recording):
-        warn_about_conventions(source)
+    warn_about_conventions(source)
     return run(**options).estimate
 
 
@@ -172,8 +171,7 @@ def smooth(
     (30001, 4)
     """
     options = locals()
-    if isinstance(source, Recording):
-        warn_about_conventions(source)
+    warn_about_conventions(source)
     return run(**options, smooth=True).estimate
 
 
@@ -314,7 +312,12 @@ def _run_recording(
     return Run(estimate, result.record, parameters.setup, result.initial, result.calibration)
 
 
-def warn_about_conventions(source: Recording) -> None:
+class ConventionWarning(UserWarning):
+    """Axes, signs or units of a recording seem wrong."""
+
+
+def warn_about_conventions(source: ImuRecord | Recording) -> None:
     """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
-    for words in ahrs.check_conventions.examine(source).warnings:
-        warnings.warn(f"{source.source}: {words}", stacklevel=3)
+    if isinstance(source, Recording):
+        for words in ahrs.check_conventions.examine(source).warnings:
+            warnings.warn(f"{source.source}: {words}", ConventionWarning, stacklevel=3)

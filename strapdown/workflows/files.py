@@ -77,14 +77,7 @@ def read(
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
-    declared = {
-        "units": units,
-        "columns": columns,
-        "topic": topic,
-        "axes": axes,
-        "invert": invert,
-        "gyro_alone": gyro_alone,
-    }
+    declared = {"units": units, "columns": columns, "topic": topic, "axes": axes, "invert": invert}
     options: dict[str, Any] = {name: value for name, value in declared.items() if value}
     if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
         if topic:
@@ -93,17 +86,15 @@ def read(
         return recordings.with_axes(table, axes, invert) if axes or invert else table
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
-    kinds = {recordfiles.KIND: "record", "strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
+    kinds = {recordfiles.KIND: "a record", "strapdown estimate": "an estimate", "strapdown montecarlo": "a Monte Carlo"}
     kind = kinds.get(reading.kind(file), "")
     if not kind:
-        return recordings.read(file, **options)
-    if options:
-        raise InputError(
-            f"{file} is a {kind} of this package and declares its own layout; leave {', '.join(options)} out"
-        )
-    if kind == "record":
+        return recordings.read(file, gyro_alone=gyro_alone, **options)
+    for name, value in options.items():
+        raise InputError(f"{file} is {kind} of this package and declares its own layout; leave {Hint(name, value)} out")
+    if kind == "a record":
         return recordfiles.read_record(file)
-    if kind == "estimate":
+    if kind == "an estimate":
         return setups.read_estimate(file)
     from strapdown.montecarlo import campaign
 
