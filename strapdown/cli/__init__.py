@@ -4,8 +4,7 @@ A result replaces an earlier result of the same name completely. ``estimate``, `
 that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
 - ``terminal``: Functions shared by all commands.
-- ``progress``: Progress of long computations.
-- ``reading``: Options of every command that reads a recording.
+- ``options``: Options of several commands.
 
 The other modules define the commands that :data:`COMMANDS` assigns to them.
 """
@@ -24,8 +23,7 @@ from typing import Any
 import typer
 
 from strapdown.checks import OF_YOUR_OWN, InputError
-from strapdown.cli.progress import be_quiet, errors
-from strapdown.cli.terminal import app, console
+from strapdown.cli.terminal import app, be_quiet, console, errors
 
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {

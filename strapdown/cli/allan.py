@@ -11,7 +11,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, count, one_of, positive
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Samples
+from strapdown.cli.options import FORMAT, RECORDING_HELP, Format, Samples
 from strapdown.files import plain, reading, write_json, write_text
 
 
@@ -34,7 +34,7 @@ class _Output:
     """Output."""
 
     out: Path = Option(Path("allan-results"), help="Folder for gyro.toml, allan.json and the figure.")
-    form: ui.Format = ui.FORMAT
+    form: Format = FORMAT
     kalibr: bool = Option(False, "--kalibr", help="Also write imu.yaml; needs gyro and accelerometer.")
     factor: float = Option(1.0, help="Factor on the noise in imu.yaml, usually 5 to 10.")
     px4: bool = Option(False, "--px4", help="Also write px4.params of EKF2; needs gyro and accelerometer.")
@@ -98,10 +98,9 @@ def _identified(
             fit = sd.fit_noise(source, sensor=sensor, highest_frequency=options.highest_frequency)
             deviation = sd.allan_deviation(source, sensor=sensor)
             figure = sd.plots.allan_overview(deviation, fit)
-    length = (
-        f"{number} samples at {1.0 / source.sample_interval:.6g} Hz, {number * source.sample_interval / 3600.0:.3g} h"
-    )
-    ui.say(f"{recording.name}: {length}.", *source.remarks)
+    dt = source.sample_interval
+    length = f"{recording.name}, {number} samples at {1.0 / dt:.6g} Hz, {number * dt / 3600.0:.3g} h"
+    ui.say(f"{length}.", *source.remarks)
     if fit.samples < number:
         ui.say(
             f"Because of gaps the fit uses {fit.samples} samples in segments of {sd.allan.noise_fit.SHORTEST} or more; the deviation uses "
@@ -109,7 +108,7 @@ def _identified(
         )
     ui.show(fit.listing(), notes=False)
     ui.say("For a term not detected in this record, the last column is an upper bound.")
-    write_text(specification, sd.allan.parameters.to_specification(fit, f"{recording.name}, {length}"))
+    write_text(specification, sd.allan.parameters.to_specification(fit, length))
     curve = {"tau_s": deviation.taus, f"deviation_{sd.allan.temperature.UNITS[sensor][1]}": deviation.deviation}
     write_json(numbers, plain({"source": recording.name, **fit.summary(), **curve}))
     if options.temperature is not None:
@@ -117,9 +116,4 @@ def _identified(
         paths.append(warm)
     ui.written(*paths, *sd.plots.save_as({drawing: figure}, output.form))
     ui.say(*(f"warning: {warning}" for warning in fit.warnings))
-    if fit.warnings:
-        ui.say(
-            f"Cut the recording to an interval where the {sensor} is at rest, or exclude the band of a filter by --highest-frequency.",
-            f"warning: {sd.allan.parameters.DISTRUST}, nor {specification.name}.",
-        )
     return fit

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +12,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, count
 from strapdown.cli import terminal as ui
-from strapdown.cli.progress import rate_text
+from strapdown.cli.options import GYRO, SCENARIO, STATES, options_given
 from strapdown.files import write_json
 
 if TYPE_CHECKING:
@@ -34,13 +32,13 @@ class _Model:
         help="TOML with a table named filter, as of `strapdown tune`; or FILE.py:NAME, your own filter, which is executed. Default: a "
         "matched one.",
     )
-    gyro: Path | None = ui.GYRO
+    gyro: Path | None = GYRO
     dispersions: Path | None = Option(
         None,
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
-    states: bool | None = ui.STATES
+    states: bool | None = STATES
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class _Computing:
 @ui.command("tables")
 def montecarlo(
     *,
-    scenario: str = Argument(help=f"{ui.SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
+    scenario: str = Argument(help=f"{SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
     model: _Model,
     computing: _Computing,
     out: Path | None = Option(None, help="HDF5 file. Default: NAME-montecarlo.h5 with the name of the scenario."),
@@ -113,7 +111,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Any, Plan]:
         held = campaigns.read(source)
         if own:
             held, model = campaigns.with_filter(held, setup, source), replace(model, filter_file=None)
-        for name in ui.options_given(model):
+        for name in options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
     plan = workflows.plan(
@@ -149,65 +147,34 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
             client = stack.enter_context(dask_client(workers=options.workers, address=options.cluster))
             workers = on_dask(client)
             ui.say(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
-        stop_if_asked = stack.enter_context(asked_to_stop())
         advance = stack.enter_context(ui.progress_bar("runs", runs))
-
-        def advanced(number: int) -> None:
-            advance(number)
-            stop_if_asked()
-
         how = {name: getattr(options, name) for name in ("resume", "overwrite", "chunk", "machine", "threads")}
         try:
-            return campaigns.run(plan, target, runs=runs, workers=workers, progress=advanced, **how)
+            return campaigns.run(plan, target, runs=runs, workers=workers, progress=advance, **how)
         except KeyboardInterrupt:
             ui.say(f"The completed runs are in {target}; continue with --resume.")
             raise
 
 
-@contextlib.contextmanager
-def asked_to_stop() -> Iterator[Callable[[], None]]:
-    """Treat SIGTERM, which batch systems send before they kill a process, as Ctrl-C, so that completed runs are written.
-
-    Yields a function that raises again after a signal: Python drops an exception that is raised while a weak reference is cleared.
-    """
-    asked: list[int] = []
-
-    def stop(*signals: Any) -> None:
-        asked.extend(signals[:1])
-        if asked:
-            raise KeyboardInterrupt
-
-    heeded = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, stop) for number in heeded}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _shown(campaign: Campaign) -> dict[str, Any]:
     """Print the statistics and the verdict of `strapdown check`; return the content of the JSON file."""
     from strapdown.estimation.setup import MEKF
-    from strapdown.montecarlo.verdicts import bound_of, tables
+    from strapdown.montecarlo.verdicts import tables
 
-    judgement = sd.check(campaign)
-    assert campaign.statistics is not None
-    numbers = sd.montecarlo.summary(campaign.statistics, bound=bound_of(campaign.plan))
-    ui.show(*tables(numbers))
-    ui.say("Use --replay to examine a run.")
-    done, seconds = campaign.statistics.runs, campaign.seconds
-    rate = f" ({rate_text(done / seconds)} runs/s, including compilation)" if seconds > 0.0 else ""
+    judgement, content, seconds = sd.check(campaign), campaign.summary(), campaign.seconds
+    ui.show(*tables(content))
+    rate = f" ({ui.rate_text(content['runs'] / seconds)} runs/s, including compilation)" if seconds > 0.0 else ""
     ui.say(
+        "Use --replay to examine a run.",
         f"{campaign.extent}, {seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} statistics of `strapdown check`: a "
-        f"consistent filter passes with {100.0 * numbers['confidence_level']:g} %.",
+        f"consistent filter passes with {100.0 * judgement.confidence_level:g} %.",
         judgement.words,
     )
     if judgement.verdict == "cannot tell":
         ui.say("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         ui.say("--states adds states for most of these errors to the filter.")
-    return {**campaign.summary(), "judgement": judgement.summary(), **numbers}
+    return content
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:

@@ -11,13 +11,12 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Layout
+from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers, options_given
 from strapdown.files import write_json
 
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml")
-"""Files that the command may write to its folder, in addition to figures."""
-FIGURES = ("estimate", "errors", "states")
-"""Figures that it may write there, without the suffix of their format."""
+FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml", *FIGURES)
+"""Files that the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """Files that other commands write there about an estimate."""
 
@@ -26,7 +25,7 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 class _Shared:
     """Filter."""
 
-    gyro: Path | None = ui.GYRO
+    gyro: Path | None = GYRO
     gate: float | None = Option(None, help="Reject measurements beyond this quantile of chi-squared, and recover.")
     robust: str | None = Option(None, help="Weight measurements by their innovations: huber or student.")
     full_covariance: bool | None = Option(
@@ -46,8 +45,8 @@ class _Shared:
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Path | None = ui.FILTER
-    states: bool | None = ui.STATES
+    filter_file: Path | None = FILTER
+    states: bool | None = STATES
     state: list[str] | None = Option(None, help="Only this state, such as gyro.scale or SENSOR.bias; repeatable.")
     attitude: str | None = Option(None, help="Initial attitude, w,x,y,z. Default: from the first measurements.")
     from_truth: bool = Option(False, "--from-truth", help="Start from the truth with errors drawn from the filter's σ.")
@@ -60,7 +59,7 @@ class _Specified:
             raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
         initial: Any = "truth" if self.from_truth else None
         if self.attitude is not None:
-            initial = ui.numbers("--attitude", self.attitude, "four numbers w,x,y,z", 4)
+            initial = numbers("--attitude", self.attitude, "four numbers w,x,y,z", 4)
         setup = self.filter_file and sd.estimation.setup.read_setup(self.filter_file)
         return {"setup": setup, "states": self.state or self.states, "initial": initial, "every": self.every}
 
@@ -90,7 +89,7 @@ class _Recorded:
             return None
         if self.place is None or self.date is None:
             raise InputError("--place and --date go together: the field drifts; give both")
-        place = ui.numbers("--place", self.place, "LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT", 2, 3)
+        place = numbers("--place", self.place, "LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT", 2, 3)
         return sd.ahrs.MagneticField.at(*place, date=self.date)
 
     @property
@@ -116,7 +115,7 @@ class _Output:
     euler: str | None = Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = Option(None, help="With --to: fixed frame, enu (default) or ned; body axes are not changed.")
     figures: bool = Option(False, "--figures", help="Draw the estimate, its states and errors; --format does too.")
-    form: ui.Format | None = Option(None, "--format", help=ui.FORMAT.help)
+    form: Format | None = Option(None, "--format", help=FORMAT.help)
 
     def exports(self, recording: Path, *, changed: bool, simulated: bool) -> dict[Path, dict[str, Any]]:
         """Return the additional files with the options of their writers; raise an error for those that cannot be written."""
@@ -150,14 +149,12 @@ def estimate(
     `strapdown simulate`, the filter matches it.
     """
     from strapdown.workflows.estimating import run as run_filter
-    from strapdown.workflows.estimating import warn_about_conventions
 
     out, form = output.out, output.form or ("png" if output.figures else None)
-    names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
-    ui.check_files(*(out / name for name in names), own="strapdown estimate")
+    ui.check_files(*(out / name for name in FILES), own="strapdown estimate")
     simulated = sd.recordings.is_record(recording)
     exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
-    for name in ui.options_given(recorded if simulated else specified):
+    for name in options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
     options, field = shared.options | (specified.options if simulated else recorded.options), recorded.field
     with ui.progress_bar("reading"):
@@ -165,30 +162,26 @@ def estimate(
     if not simulated:
         if field is not None and source.magnetic_field is None:
             raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
-        warn_about_conventions(source)
+        sd.ahrs.check_conventions.warn(source)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = run_filter(source, walks=shared.observability, **options)
     result = run.estimate if field is None else field.to_true_north(run.estimate)
     ui.say(*result.remarks)
     ui.show(result.listing())
-    contents: dict[str, Any] = {}
-    if result.error_states:
-        contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
+    parts: dict[str, Any] = {}
     if shared.observability:
         with ui.progress_bar("observability"):
-            analysis = sd.estimation.setup.observability(run.record, run.setup, run.initial)
-        ui.say(str(analysis))
-        contents["observability.json"] = analysis.summary()
+            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
     if result.truth is not None:
-        accuracy = sd.accuracy(result)
-        ui.show(accuracy.listing())
-        contents["errors.json"] = accuracy.summary()
+        parts["errors.json"] = sd.accuracy(result)
+    ui.show(*(part.listing() for part in parts.values()))
     if field is not None:
-        compared = field.compared(source, result)
-        ui.say(str(compared))
-        contents["field.json"] = compared.summary()
-    figures = (f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf", "svg"))
-    for name in (*FILES[1:], *figures, *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
+        parts["field.json"] = field.compared(source, result)
+        ui.say(str(parts["field.json"]))
+    contents = {file: part.summary() for file, part in parts.items()}
+    if result.error_states:
+        contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
+    for name in (*FILES[1:], *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
     paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():

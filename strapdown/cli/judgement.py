@@ -11,6 +11,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
+from strapdown.cli.options import options_given
 from strapdown.files import reading
 
 
@@ -49,15 +50,14 @@ def check(
     """
     how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     # A missing file is reported as one of this package.
-    hdf5 = result.suffix.lower() in (".h5", ".hdf5") or (result.is_file() and reading.is_hdf5(result))
-    own = (hdf5 or not result.exists()) and foreign.truth is None
+    own = foreign.truth is None and (not result.exists() or bool(reading.kind(result)))
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to search for causes")
     if record is not None and not own:
         raise InputError(
             "--record goes with an estimate of `strapdown estimate` without --truth; leave out --truth or --record"
         )
-    for name in ui.options_given(foreign) if foreign.truth is None else ():
+    for name in options_given(foreign) if foreign.truth is None else ():
         raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.aligned is not None:
         ui.check_files(foreign.aligned, suffixes=(".h5", ".hdf5"), name="aligned")
@@ -130,9 +130,6 @@ def report(
     out: Path | None = Option(None, "--out", "-o", help="The page, .html. Default: beside the result."),
 ) -> None:
     """Write a self-contained HTML page about a result: verdict, numbers, figures, provenance; and the statistics as JSON."""
-    reading.existing_file(result)
-    page = result.with_suffix(".html") if out is None else out
-    ui.check_files(page, page.with_suffix(".report.json"))
     with ui.progress_bar("judging, drawing"):
         done = sd.report.write(result, out, other=other)
     ui.say(f"{result.name}: {done.verdict}.")

@@ -10,7 +10,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Layout
+from strapdown.cli.options import RECORDING_HELP, Layout
 from strapdown.files import reading
 
 
@@ -44,13 +44,11 @@ def calibrate(
 
     Turn the unit about all its axes for a minute or more, with pauses of some seconds in different positions. What is missing is said.
     """
-    from strapdown.workflows.estimating import warn_about_conventions
-
     ui.check_files(out, suffixes=(".toml",), own=sd.calibration.read)
     with ui.progress_bar("reading"):
         sources = [sd.recordings.read(path, **layout.options) for path in recordings]
     for source in sources:
-        warn_about_conventions(source)
+        sd.ahrs.check_conventions.warn(source)
     with ui.progress_bar("calibrating"):
         result = sd.calibrate(sources, gravity=gravity)
     ui.show(result.listing())

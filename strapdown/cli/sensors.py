@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from typer import Argument, Option
 
 import strapdown as sd
 from strapdown.cli import terminal as ui
+from strapdown.cli.options import SCENARIO
 
 
 @ui.command()
@@ -44,7 +44,7 @@ def keys(
 
 @ui.command()
 def simulate(
-    scenario: str = Argument(help=ui.SCENARIO),
+    scenario: str = Argument(help=SCENARIO),
     out: Path | None = Option(None, help="HDF5 file. Default: .h5 with the name, or the TOML file, of the scenario."),
     seed: int | None = Option(None, help="Seed. Default: that of the scenario."),
 ) -> None:
@@ -56,11 +56,4 @@ def simulate(
         record = sd.scenarios.simulate(loaded, seed)
         sd.write(record, target)
     ui.show(record.listing())
-    for series in record.vectors:
-        sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
-        if series.covariance is None and np.any(sigma == 0.0):
-            ui.say(
-                f"warning: {series.sensor}: its sigma is zero, which a filter cannot use; add noise in the scenario, or give the filter "
-                "another sigma in [filter.sigma]"
-            )
     ui.written(target)

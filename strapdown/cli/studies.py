@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from typer import Argument, Option
 
 import strapdown as sd
 from strapdown.checks import non_negative, one_of
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Layout
+from strapdown.cli.options import FILTER, FORMAT, RECORDING_HELP, SCENARIO, STATES, Format, Layout, by_name, numbers
 from strapdown.files import reading, write_json
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
@@ -26,7 +26,7 @@ def coning(
     seed: int = Option(1, help="Seed; the same one gives the same runs."),
     out: Path = Option(Path("coning-results"), help="Folder for coning.json and the figures."),
     algorithm: list[Path] | None = Option(None, help="TOML of your own algorithms; repeatable."),
-    form: ui.Format = ui.FORMAT,
+    form: Format = FORMAT,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and its effect on a filter."""
     from strapdown.montecarlo import coning_study
@@ -35,8 +35,6 @@ def coning(
     motion = {"angle": angle * DEGREE, "frequency": frequency, "rate": rate, "duration": duration}
     parameters = coning_study.ConingParameters(**motion, runs=runs, seed=seed, own=own)  # type: ignore[arg-type]
     ui.check_files(out / "coning.json", *(out / f"{name}.{form}" for name in ("drift", "errors", "consistency")))
-    if own:
-        ui.show(coning_study.own_table(own))
     with ui.progress_bar("runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()
@@ -56,9 +54,9 @@ def _considered(texts: list[str], sensors: Any) -> dict[str, Any]:
         sizes |= zip((f"{sensor.name}.{what}" for what in fields), (bias, ARCSECOND, 1e-3), strict=True)
     errors: dict[str, Any] = {field: {} for field in fields.values()}
     initial: dict[str, float] = {}
-    for name, text in ui.by_name("--consider", texts, "NAME=VALUE, such as scale_factor=300").items():
+    for name, text in by_name("--consider", texts, "NAME=VALUE, such as scale_factor=300").items():
         one_of("--consider", name, sizes)
-        (number,) = ui.numbers(f"--consider {name}", text, "a number", 1)
+        (number,) = numbers(f"--consider {name}", text, "a number", 1)
         value = non_negative(f"--consider {name}", number) * sizes[name]
         sensor, _, what = name.rpartition(".")
         if sensor == "initial":
@@ -70,7 +68,7 @@ def _considered(texts: list[str], sensors: Any) -> dict[str, Any]:
 
 @ui.command("tables")
 def covariance(
-    scenario: str = Argument(help=ui.SCENARIO),
+    scenario: str = Argument(help=SCENARIO),
     consider: list[str] | None = Option(
         None,
         metavar="ERROR=σ",
@@ -78,11 +76,11 @@ def covariance(
         "SENSOR.bias (nT, m/s², arcsec), SENSOR.mounting (arcsec), SENSOR.delay (ms); or the true 1σ initial.attitude (°), initial.bias "
         "(°/h). Repeatable.",
     ),
-    filter_file: Path | None = ui.FILTER,
-    states: bool | None = ui.STATES,
+    filter_file: Path | None = FILTER,
+    states: bool | None = STATES,
     epochs: int = Option(100, help="Number of epochs over the duration of the scenario."),
     out: Path = Option(Path("covariance-results"), help="Folder for covariance.json and the figure."),
-    form: ui.Format = ui.FORMAT,
+    form: Format = FORMAT,
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
     from strapdown.estimation import setup
@@ -127,28 +125,14 @@ def integrate(
     out: Path = Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
-    from strapdown.ahrs.remarks import gap_words
-
     ui.check_files(out, suffixes=(".h5", ".hdf5"), own="strapdown attitude")
     rule = sd.coning.named(algorithm)
     with ui.progress_bar("reading, integrating, writing"):
         source: Any = sd.read(recording, gyro_alone=True, **layout.options)
         with reading.from_file(recording):
-            time, attitude = sd.integrate(source, rule)
-        sd.records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": rule.name})
-    samples = len(source.time) - 1
-    ui.say(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {rule.name}.")
-    if left := samples % rule.samples:
-        ui.say(f"Samples not used at the end, an incomplete step of {rule.samples}: {left}.")
-    simulated = isinstance(source, sd.records.ImuRecord)
-    truth = source.truth and source.truth.attitude if simulated else source.true_attitude
-    if truth is not None and (known := np.isfinite(truth[:: rule.samples][: len(attitude)]).all(axis=1)).any():
-        true = sd.quaternion.normalize(truth[:: rule.samples][: len(attitude)][known])
-        error = np.degrees(sd.quaternion.angle_between(true, attitude[known]))
-        ui.say(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
-    if not simulated:
-        gaps = gap_words(sd.recordings.gaps(source.time))
-        ui.say(gaps and f"{gaps}: the rotation during a gap is interpolated.", *source.remarks, source.left_out_words)
+            history = replace(sd.integrate(source, rule), source=recording.name)
+        sd.write(history, out)
+    ui.say(*history.remarks)
     ui.written(out)
 
 

@@ -1,4 +1,7 @@
-"""Functions shared by all commands: the application and its console, declaration of a command, shared options, tables, checks of files."""
+"""Functions shared by all commands: the consoles, declaration of a command, tables, checks of files, and progress of long computations.
+
+Progress is on standard error: a bar on a terminal, otherwise a line every ten seconds.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,53 @@ import dataclasses
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, get_type_hints
 
+import rich.progress as bars
 import rich.table
 import typer
 from rich import box
+from rich.console import Console
 from rich.text import Text
 from typer import Option
 
-from strapdown.checks import InputError
-from strapdown.cli.progress import PlainConsole, progress_bar  # noqa: F401 (for the commands)
+from strapdown.checks import Hint, InputError
 from strapdown.files import json_text, reading, usable_folder, writable, write_json
 
 if TYPE_CHECKING:
     from strapdown.results import Table
+
+_CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
+"""Control characters except tab and newline."""
+_OPTIONS = {"initial": "--attitude or --from-truth", "noise": "--gyro", "priors": "--prior"}
+_OPTIONS |= {"estimator": "--filter", "setup": "--filter"}
+"""Options whose names differ from those of the argument in Python."""
+
+
+def option(hint: Hint) -> str:
+    """Return the option for an argument of Python, with its value."""
+    name = hint.argument.replace("_", "-")
+    flag = _OPTIONS.get(hint.argument, f"--no-{name}" if hint.value is False else f"--{name}")
+    if hint.value is None or isinstance(hint.value, bool):
+        return flag
+    if hint.argument == "units":
+        return " ".join(f"--{name}-unit {unit}" for name, unit in hint.value.items())
+    parts = hint.value.items() if isinstance(hint.value, dict) else ()
+    return f"{flag} {','.join(f'{name}={value}' for name, value in parts) or hint.value}"
+
+
+class PlainConsole(Console):
+    """A console that names options in hints, and shows no control characters: names of files may hold sequences that change a terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text with options in its hints and a mark in place of each control character."""
+        return super().render_str(Hint.replaced(text, option).translate(_CONTROL), **options)
+
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -31,30 +65,18 @@ app = typer.Typer(
 )
 # Without markup, so that brackets in file names are printed; a statement is one line, which the terminal wraps.
 console = PlainConsole(markup=False, highlight=False, soft_wrap=True)
+errors = PlainConsole(stderr=True, markup=False, highlight=False)
 
-Format = Literal["png", "pdf", "svg"]
-"""Formats of figures."""
-FORMAT: Any = Option("png", "--format", help="Format of the figures.")
-FILTER: Any = Option(None, "--filter", help="TOML with a table named filter. Default: a matched one.")
-STATES: Any = Option(
-    None,
-    "--states/--no-states",
-    help="A state for each specified error, or none. Default: if the matched filter needs them.",
-)
-GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
-SCENARIO = "Name of a built-in scenario, or a TOML file."
 _EXTRA: dict[str, Any] = {
     "tables": Option(None, help="Folder to which the tables are also written, as CSV with all digits and as LaTeX."),
     "json": Option(None, "--json", help="File for all numbers; - for standard output."),
 }
 """Options that :func:`command` adds and serves."""
-STANDARD_OUTPUT = Path("-")
 OUTPUTS = ("out", "to", "target", "aligned", "json", "tables")
 """Parameters of commands that name files to write; paths in all others are read."""
 CANNOT_TELL = 3
 STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1}
 """Exit status of a verdict, otherwise :data:`CANNOT_TELL`; 2 is that of bad usage or input."""
-
 
 _running: dict[str, Any] = {"name": "", "paths": [], "tables": []}
 """Of the command that runs: its name, the paths that it reads, and the tables that it has shown."""
@@ -69,26 +91,41 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
 
     def registered(function: Callable[..., Any]) -> Callable[..., None]:
         hints: dict[str, Any] = get_type_hints(function)
-        groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+        groups = [name for name, hint in hints.items() if dataclasses.is_dataclass(hint)]
 
         @functools.wraps(function)
         def run(**values: Any) -> None:
-            paths = [value for name, value in values.items() if name not in OUTPUTS]
-            paths = [path for value in paths for path in (value if isinstance(value, list) else [value])]
-            paths = [path for path in paths if isinstance(path, (str, Path))]
-            _running.update(name=function.__name__, paths=paths, tables=[])
+            given = (value for name, value in values.items() if name not in OUTPUTS)
+            paths = [path for value in given for path in (value if isinstance(value, list) else [value])]
+            _running.update(
+                name=function.__name__, paths=[path for path in paths if isinstance(path, (str, Path))], tables=[]
+            )
             folder, target = (values.pop(name, None) for name in ("tables", "json"))
-            if target == STANDARD_OUTPUT:  # all other output then goes to standard error
+            printed = target == Path("-")
+            if printed:  # all other output then goes to standard error
                 console.stderr = True
             elif target is not None:
                 check_files(target, suffixes=(".json",), name="json")
             if folder is not None:
                 usable_folder("--tables", folder)
-            for name, group in groups.items():
-                values[name] = group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
-            _end(function(**values) or {}, target, folder)
+            for name in groups:
+                fields = [field.name for field in dataclasses.fields(hints[name])]
+                values[name] = hints[name](**{field: values.pop(field) for field in fields})
+            numbers = function(**values) or {}
+            if printed:
+                sys.stdout.write(json_text(numbers))
+            elif target is not None:
+                write_json(target, numbers)
+                written(target)
+            if folder is not None:
+                from strapdown.report.tables import write
 
-        parameters = [*_parameters(function), *(_parameter(name, _EXTRA[name], Path | None) for name in extra)]
+                written(*write([table for table in _running["tables"] if table.name], folder))
+            if "verdict" in numbers:
+                raise typer.Exit(STATUS.get(numbers["verdict"], CANNOT_TELL))
+
+        parameters = list(_parameters(function, hints))
+        parameters += [inspect.Parameter(name, KEYWORD, default=_EXTRA[name], annotation=Path | None) for name in extra]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return app.command()(run)
@@ -96,48 +133,19 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
     return registered
 
 
-def _parameter(name: str, default: Any, annotation: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
-def _parameters(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
-    """Yield the parameters of a command, for a group its fields; the first line of its docstring is their heading in --help."""
-    hints = get_type_hints(function)
+def _parameters(function: Callable[..., Any], hints: dict[str, Any]) -> Iterator[inspect.Parameter]:
+    """Yield the parameters of a command or of a group; those of a group have the first line of its docstring as heading in --help."""
     for name, parameter in inspect.signature(function).parameters.items():
-        if not dataclasses.is_dataclass(hints[name]):
-            yield _parameter(name, parameter.default, hints[name])
-            continue
-        types = get_type_hints(hints[name])
-        for field in dataclasses.fields(hints[name]):
-            option: Any = copy.copy(field.default)
-            option.rich_help_panel = str(hints[name].__doc__).partition("\n")[0].rstrip(".")
-            yield _parameter(field.name, option, types[field.name])
-
-
-def _end(numbers: dict[str, Any], target: Path | None, folder: Path | None) -> None:
-    """Write numbers and tables where they are wanted, and end with the status of a verdict."""
-    if target == STANDARD_OUTPUT:
-        sys.stdout.write(json_text(numbers))
-    elif target is not None:
-        write_json(target, numbers)
-        written(target)
-    if folder is not None:
-        from strapdown.report.tables import write
-
-        written(*write([table for table in _running["tables"] if table.name], folder))
-    if "verdict" in numbers:
-        raise typer.Exit(STATUS.get(numbers["verdict"], CANNOT_TELL))
-
-
-def options_given(group: Any) -> list[str]:
-    """Return the options of a group that were given, as on the command line."""
-    flags = []
-    for field in dataclasses.fields(group):
-        option: Any = field.default
-        if getattr(group, field.name) not in (option.default, []):
-            flag = option.param_decls[0] if option.param_decls else "--" + field.name.replace("_", "-")
-            flags.append(flag.partition("/")[0])
-    return flags
+        if dataclasses.is_dataclass(hints[name]):
+            for field in _parameters(hints[name], get_type_hints(hints[name])):
+                option = copy.copy(field.default)
+                option.rich_help_panel = str(hints[name].__doc__).partition("\n")[0].rstrip(".")
+                yield field.replace(default=option)
+        else:
+            yield parameter.replace(kind=KEYWORD, annotation=hints[name])
 
 
 def say(*sentences: str) -> None:
@@ -202,25 +210,79 @@ def written(*paths: Any) -> None:
         console.print("Written: " + ", ".join(map(str, paths)))
 
 
-def by_name(option: str, texts: Iterable[str], form: str) -> dict[str, str]:
-    """Return the values of an option by name, given as texts NAME=VALUE; ``form`` is the one to give."""
-    values: dict[str, str] = {}
-    for text in filter(None, texts):
-        name, _, value = (part.strip() for part in text.partition("="))
-        if not name or not value:
-            raise InputError(f"{option} is {text.strip()!r}; give {form}")
-        if name in values:
-            raise InputError(f"{option}: {name} is given twice; give it once")
-        values[name] = value
-    return values
+# ---------------------------------------------------------------------------------------------------------------- progress
+
+LINE_INTERVAL = 10.0
+"""Time between two lines if the output is no terminal, s."""
+
+_quiet = False
 
 
-def numbers(option: str, text: str, form: str, *lengths: int) -> list[float]:
-    """Return the numbers of an option, separated by commas; ``form`` says which to give, ``lengths`` how many there may be."""
+def be_quiet() -> None:
+    """Show no progress from now on."""
+    global _quiet  # noqa: PLW0603 (one process runs one command)
+    _quiet = True
+
+
+def rate_text(speed: float) -> str:
+    """Return a rate with three digits, or as an integer if it has more."""
+    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
+
+
+class _Rate(bars.ProgressColumn):
+    """Runs per second, recent or, of a finished task, on average."""
+
+    def render(self, task: bars.Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{rate_text(speed)} runs/s")
+
+
+Advance = Callable[[int | str], None]
+"""Advances the progress by a number of units, or sets the description of the current task."""
+
+
+@contextmanager
+def progress_bar(what: str, total: int | None = None) -> Iterator[Advance]:
+    """Yield a function that advances the progress; without ``total`` only the time is shown."""
+    if _quiet:
+        yield lambda step: None
+    elif errors.is_terminal:
+        known = (
+            (bars.MofNCompleteColumn(), *([_Rate()] if what == "runs" else []), bars.TimeRemainingColumn())
+            if total
+            else ()
+        )
+        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
+        with bars.Progress(*columns, console=errors, transient=True) as progress:
+            task = progress.add_task(what, total=total)
+            yield lambda step: progress.update(
+                task, **({"description": step} if isinstance(step, str) else {"advance": step})
+            )
+    else:
+        with _lines(what, total) as advance:
+            yield advance
+
+
+@contextmanager
+def _lines(what: str, total: int | None) -> Iterator[Advance]:
+    done, begin, ended = 0, time.monotonic(), Event()
+
+    def advance(step: int | str) -> None:
+        nonlocal done, what
+        if isinstance(step, str):
+            what = step
+        else:
+            done += step
+
+    def watch() -> None:
+        while not ended.wait(LINE_INTERVAL):
+            share = "" if total is None else f" {done} of {total},"
+            errors.print(f"{what}:{share} {time.monotonic() - begin:.0f} s", soft_wrap=True)
+
+    watcher = Thread(target=watch, daemon=True)
+    watcher.start()
     try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in lengths:
-        raise InputError(f"{option} is {text!r}; give {form}")
-    return values
+        yield advance
+    finally:
+        ended.set()
+        watcher.join()

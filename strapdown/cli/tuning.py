@@ -11,7 +11,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, count, one_of
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import Layout
+from strapdown.cli.options import FILTER, FORMAT, Format, Layout
 from strapdown.files import write_json
 
 FIGURES = ("likelihood", "heldout")
@@ -28,7 +28,7 @@ class _Filter:
         "initial.bias, gate.probability; or only filter.scale. Default: the two of the gyro and the sigma of every sensor; for a recording "
         "without --truth only filter.scale is allowed.",
     )
-    filter_file: Path | None = ui.FILTER
+    filter_file: Path | None = FILTER
     states: bool = Option(
         False,
         "--states",
@@ -82,7 +82,7 @@ def tune(
     search: _Search,
     layout: Layout,
     out: Path = Option(Path("filter.toml"), "--out", "-o", help="TOML for --filter; beside it JSON and figures."),
-    form: ui.Format = ui.FORMAT,
+    form: Format = FORMAT,
 ) -> None:
     """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
     from strapdown.plots import tuning as drawing
@@ -95,15 +95,16 @@ def tune(
     beside, places = out.with_suffix(".json"), {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
     ui.check_files(out, suffixes=(".toml",), own=lambda _: tunings.read(beside))
     ui.check_files(beside, *places.values(), own=tunings.read)
-    options = start.options
-    sources = _sources(records, options["setup"], start.states, layout)
-    if options["setup"] and (options["setup"].gate or options["setup"].robust) and not (goal.truth or goal.gate):
-        ui.say(
-            "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
-            "and --truth tunes the filter with its gate and weights."
-        )
+    sources: dict[str, Any] = {}
+    for path in records:
+        simulated = sd.recordings.is_record(path)
+        source: Any = sd.read(path, **({} if simulated else layout.options))
+        if start.states and not simulated:
+            raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
+        ui.say("" if simulated else source.left_out_words)
+        sources[path.name if path.name not in sources else str(path)] = source
     with ui.progress_bar("searches") as advance:
-        result = sd.tune(sources, **options, **vars(goal), **vars(search), progress=advance)
+        result = sd.tune(sources, **start.options, **vars(goal), **vars(search), progress=advance)
     ui.show(*result.tables)
     ui.say(*result.words)
     sd.write(result.setup, out)
@@ -120,20 +121,3 @@ def tune(
         title = "Held-out part of the first record"
         figures[places["heldout"]] = drawing.before_and_after(result.comparison, title=title)
     ui.written(out, beside, *sd.plots.save_as(figures, form))
-
-
-def _sources(paths: list[Path], setup: Any, states: bool, layout: Layout) -> dict[str, Any]:
-    """Return the records by name; say what the filter of the first does not model."""
-    from strapdown.workflows.filters import matched_filter
-
-    sources: dict[str, Any] = {}
-    for path in paths:
-        simulated = sd.recordings.is_record(path)
-        source: Any = sd.read(path, **({} if simulated else layout.options))
-        if simulated and setup is None and not any(isinstance(other, type(source)) for other in sources.values()):
-            ui.say(*matched_filter(source, states=states)[1])
-        elif not simulated and states:
-            raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-        ui.say("" if simulated else source.left_out_words)
-        sources[path.name if path.name not in sources else str(path)] = source
-    return sources

@@ -26,7 +26,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
 
 def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     scenario, drifts, filters = study["scenario"], study["integration"], study["filter"]
-    drift_table, filter_table = coning_study.tables(study)
+    *own_tables, drift_table, filter_table = coning_study.tables(study)
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
     passing = [row["integration"] for row in filters if row["consistent"]]
@@ -36,6 +36,7 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         "Coning study",
         coning_study.words(study),
         page.verdict(answer, reason),
+        *map(page.listed, own_tables),
         *_charts([row["algorithm"] for row in drifts], sizes, _DRIFT),
         page.listed(drift_table),
         *_charts([row["integration"] for row in filters], filters, _FILTER),

@@ -221,6 +221,8 @@ class Tuning(Listed):
         The filter before and after on held-out data.
     unmodelled : tuple of Unmodelled
         Tests of records for errors that the tuned filter does not model.
+    remarks : tuple of str
+        What the filter that was tuned has no state for, and what of it was not applied.
     """
 
     parameters: tuple[Estimated, ...]
@@ -239,6 +241,7 @@ class Tuning(Listed):
     gate: TunedGate | None = None
     comparison: Comparison | None = None
     unmodelled: tuple[Unmodelled, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.
@@ -278,9 +281,10 @@ class Tuning(Listed):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Sentences on what the parameters do not say: the gate, errors that the filter does not model."""
+        """Sentences on what the parameters do not say: the remarks, the gate, errors that the filter does not model."""
         worst = max(self.unmodelled, key=lambda check: check.severity, default=None)
-        return (*(() if self.gate is None else (self.gate.words,)), *(() if worst is None else worst.words))
+        gate = () if self.gate is None else (self.gate.words,)
+        return (*self.remarks, *gate, *(() if worst is None else worst.words))
 
     @property
     def tables(self) -> list[Table]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -112,7 +111,7 @@ def estimate(
 
     Warns
     -----
-    ConventionWarning
+    strapdown.ahrs.ConventionWarning
         If units, axes or signs of a recording seem wrong.
 
     Examples
@@ -122,7 +121,8 @@ def estimate(
     >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
     """
     options = locals()
-    warn_about_conventions(source)
+    if isinstance(source, Recording):
+        ahrs.check_conventions.warn(source)
     return run(**options).estimate
 
 
@@ -171,7 +171,8 @@ def smooth(
     (30001, 4)
     """
     options = locals()
-    warn_about_conventions(source)
+    if isinstance(source, Recording):
+        ahrs.check_conventions.warn(source)
     return run(**options, smooth=True).estimate
 
 
@@ -310,14 +311,3 @@ def _run_recording(
         },
     )
     return Run(estimate, result.record, parameters.setup, result.initial, result.calibration)
-
-
-class ConventionWarning(UserWarning):
-    """Axes, signs or units of a recording seem wrong."""
-
-
-def warn_about_conventions(source: ImuRecord | Recording) -> None:
-    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
-    if isinstance(source, Recording):
-        for words in ahrs.check_conventions.examine(source).warnings:
-            warnings.warn(f"{source.source}: {words}", ConventionWarning, stacklevel=3)

@@ -14,8 +14,8 @@ from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
-from strapdown.workflows.estimating import SOURCE, warn_about_conventions
-from strapdown.workflows.filters import need_angles
+from strapdown.workflows.estimating import SOURCE
+from strapdown.workflows.filters import matched_filter, need_angles
 
 if TYPE_CHECKING:
     from strapdown.tuning import Prior, Tuning
@@ -91,8 +91,8 @@ def tune(
         instance("sources", source, (ImuRecord, Recording), SOURCE)
         if isinstance(source, Recording):
             ahrs.need_accelerometer(source)
-        warn_about_conventions(source)
-    own, cases = setup is not None, []
+            ahrs.check_conventions.warn(source)
+    own, remarks, cases = setup is not None, list[str](), []
     for label, source in sources.items():
         if isinstance(source, ImuRecord):
             if setup is None:
@@ -100,7 +100,7 @@ def tune(
                     raise InputError(
                         f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
                     )
-                setup = setups.FilterSetup.for_record(source, states=states)
+                setup, remarks = matched_filter(source, states=states)
             elif own and states:
                 if setup.states is not None:
                     raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
@@ -112,6 +112,11 @@ def tune(
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(source))
     assert setup is not None
+    if own and (setup.gate or setup.robust) and not (truth or gate):
+        remarks.append(
+            "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. "
+            f"{Hint('gate', True)} models outliers, and {Hint('truth', True)} tunes the filter with its gate and weights."
+        )
     if not (truth or all(isinstance(source, ImuRecord) for source in sources.values())):
         free, spacing = tuning.by_innovations(free, spacing, gate=gate, priors=priors)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout)
@@ -123,7 +128,7 @@ def tune(
     if isinstance(priors, GyroSpec):
         by_gyro = tuning.priors_from_gyro(priors, train[0].record)
         priors = {name: prior for name, prior in by_gyro.items() if name in wanted}
-    return tuning.tune(
+    result = tuning.tune(
         train,
         setup,
         [*wanted, *(name for name in free or () if name in tuning.GATED)],
@@ -137,3 +142,4 @@ def tune(
         threads=count("threads", threads if threads is not None else os.cpu_count() or 1),
         progress=progress,
     )
+    return dataclasses.replace(result, remarks=tuple(remarks))
