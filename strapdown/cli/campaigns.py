@@ -138,7 +138,7 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
         runs = campaigns.read(target).runs if options.resume and target.exists() else 1000
     choice = sd.montecarlo.choose(plan, options.machine)
     count("runs", runs)
-    ui.say(f"{plan.scenario.name or name}: {ui.counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
+    ui.say(f"{plan.scenario.name or name}: {runs} run{'' if runs == 1 else 's'}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         workers = None
         if options.workers is not None or options.cluster is not None:

@@ -34,12 +34,6 @@ class _Shared:
     observability: bool = Option(False, "--observability", help="Report the observability of each state.")
     smooth: bool = Option(False, "--smooth", help="Also use the samples after each time (fixed-interval smoother).")
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        plain = {name: getattr(self, name) for name in ("gate", "robust", "smooth", "full_covariance")}
-        return plain | {"noise": self.gyro and sd.gyro.read_spec(self.gyro)}
-
 
 @dataclass(frozen=True, eq=False)
 class _Specified:
@@ -51,17 +45,6 @@ class _Specified:
     attitude: str | None = Option(None, help="Initial attitude, w,x,y,z. Default: from the first measurements.")
     from_truth: bool = Option(False, "--from-truth", help="Start from the truth with errors drawn from the filter's σ.")
     every: int = Option(1, help="Store every n-th filter step.")
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        if self.attitude is not None and self.from_truth:
-            raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
-        initial: Any = "truth" if self.from_truth else None
-        if self.attitude is not None:
-            initial = numbers("--attitude", self.attitude, "four numbers w,x,y,z", 4)
-        setup = self.filter_file and sd.estimation.setup.read_setup(self.filter_file)
-        return {"setup": setup, "states": self.state or self.states, "initial": initial, "every": self.every}
 
 
 @dataclass(frozen=True)
@@ -91,17 +74,6 @@ class _Recorded:
             raise InputError("--place and --date go together: the field drifts; give both")
         place = numbers("--place", self.place, "LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT", 2, 3)
         return sd.ahrs.MagneticField.at(*place, date=self.date)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        late = self.latency
-        return {
-            "motion": self.motion,
-            "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
-            "calibration": self.calibration and sd.calibration.read(self.calibration),
-            "temperature": self.temperature and sd.gyro.temperature.read(self.temperature),
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +105,28 @@ class _Output:
         return exports
 
 
+def _options(shared: _Shared, specified: _Specified, recorded: _Recorded) -> dict[str, Any]:
+    """Return the options of :func:`strapdown.estimate`."""
+    initial: Any = "truth" if specified.from_truth else None
+    if specified.attitude is not None:
+        if specified.from_truth:
+            raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
+        initial = numbers("--attitude", specified.attitude, "four numbers w,x,y,z", 4)
+    late = recorded.latency
+    return {
+        "noise": shared.gyro and sd.gyro.read_spec(shared.gyro),
+        **{name: getattr(shared, name) for name in ("gate", "robust", "smooth", "full_covariance")},
+        "setup": specified.filter_file and sd.estimation.setup.read_setup(specified.filter_file),
+        "states": specified.state or specified.states,
+        "initial": initial,
+        "every": specified.every,
+        "motion": recorded.motion,
+        "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
+        "calibration": recorded.calibration and sd.calibration.read(recorded.calibration),
+        "temperature": recorded.temperature and sd.gyro.temperature.read(recorded.temperature),
+    }
+
+
 @ui.command()
 def estimate(
     *,
@@ -156,12 +150,12 @@ def estimate(
     exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
     for name in options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
-    options, field = shared.options | (specified.options if simulated else recorded.options), recorded.field
+    options, field = _options(shared, specified, recorded), recorded.field
     with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options)
+    if field is not None and source.magnetic_field is None:
+        raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
     if not simulated:
-        if field is not None and source.magnetic_field is None:
-            raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
         sd.ahrs.check_conventions.warn(source)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = run_filter(source, walks=shared.observability, **options)

@@ -5,6 +5,7 @@ Progress is on standard error: a bar on a terminal, otherwise a line every ten s
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -12,7 +13,6 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -154,11 +154,6 @@ def say(*sentences: str) -> None:
         console.print(sentence)
 
 
-def counted(number: int, what: str) -> str:
-    """Return a number with a noun, in the plural unless it is one."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 def show(*tables: Table, title: str | None = None, notes: bool = True) -> None:
     """Print tables, optionally under another title; on a narrow terminal their lines wrap and are not cut off."""
     styles = {"pass": "green", "FAIL": "red", "likely": "red"}
@@ -237,52 +232,36 @@ class _Rate(bars.ProgressColumn):
         return Text("" if speed is None else f"{rate_text(speed)} runs/s")
 
 
-Advance = Callable[[int | str], None]
-"""Advances the progress by a number of units, or sets the description of the current task."""
-
-
-@contextmanager
-def progress_bar(what: str, total: int | None = None) -> Iterator[Advance]:
-    """Yield a function that advances the progress; without ``total`` only the time is shown."""
-    if _quiet:
-        yield lambda step: None
-    elif errors.is_terminal:
-        known = (
-            (bars.MofNCompleteColumn(), *([_Rate()] if what == "runs" else []), bars.TimeRemainingColumn())
-            if total
-            else ()
-        )
-        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
-        with bars.Progress(*columns, console=errors, transient=True) as progress:
-            task = progress.add_task(what, total=total)
-            yield lambda step: progress.update(
-                task, **({"description": step} if isinstance(step, str) else {"advance": step})
-            )
-    else:
-        with _lines(what, total) as advance:
-            yield advance
-
-
-@contextmanager
-def _lines(what: str, total: int | None) -> Iterator[Advance]:
+@contextlib.contextmanager
+def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[[int | str], None]]:
+    """Yield a function that advances the progress by a number of units, or describes it; without ``total`` only the time is shown."""
     done, begin, ended = 0, time.monotonic(), Event()
 
     def advance(step: int | str) -> None:
         nonlocal done, what
-        if isinstance(step, str):
-            what = step
-        else:
-            done += step
+        what, done = (step, done) if isinstance(step, str) else (what, done + step)
+        if bar is not None:
+            bar.update(task, description=what, completed=done)
 
     def watch() -> None:
         while not ended.wait(LINE_INTERVAL):
             share = "" if total is None else f" {done} of {total},"
             errors.print(f"{what}:{share} {time.monotonic() - begin:.0f} s", soft_wrap=True)
 
+    bar = None
+    if errors.is_terminal and not _quiet:
+        rate = [_Rate()] if what == "runs" else []
+        known = (bars.MofNCompleteColumn(), *rate, bars.TimeRemainingColumn()) if total else ()
+        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
+        bar = bars.Progress(*columns, console=errors, transient=True)
+        task = bar.add_task(what, total=total)
     watcher = Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield advance
-    finally:
-        ended.set()
-        watcher.join()
+    with bar or contextlib.nullcontext():
+        if bar is None and not _quiet:
+            watcher.start()
+        try:
+            yield advance
+        finally:
+            ended.set()
+            if watcher.ident is not None:
+                watcher.join()

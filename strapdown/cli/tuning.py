@@ -9,7 +9,7 @@ from typing import Any
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError, count, one_of
+from strapdown.checks import InputError, one_of
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import FILTER, FORMAT, Format, Layout
 from strapdown.files import write_json
@@ -88,7 +88,6 @@ def tune(
     from strapdown.plots import tuning as drawing
     from strapdown.report import tunings
 
-    count("seed", search.seed, minimum=0)
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
             raise InputError(f"{path} is given twice; give each record once")

@@ -82,6 +82,7 @@ def tune(
     """
     from strapdown import tuning
 
+    count("seed", seed, minimum=0)
     if not isinstance(sources, Mapping):
         listed = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
         sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
