@@ -132,7 +132,7 @@ def integrate(
         with reading.from_file(recording):
             history = replace(sd.integrate(source, rule), source=recording.name)
         sd.write(history, out)
-    ui.say(*history.remarks)
+    ui.say(f"{recording.name}: {history.remarks[0]}", *history.remarks[1:])
     ui.written(out)
 
 

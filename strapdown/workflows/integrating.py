@@ -73,7 +73,7 @@ def integrate(
     instance("source", source, (ImuRecord, Recording), SOURCE)
     if isinstance(source, ImuRecord):
         time, increments = source.time, source.increments
-        known, place = None if source.truth is None else source.truth.attitude, "The record"
+        known, place = None if source.truth is None else source.truth.attitude, "the record"
     else:
         place = source.source
         time, increments, known = source.time, recordings.increments(source), source.true_attitude
@@ -89,7 +89,7 @@ def integrate(
         start = known[0]
     attitude = coning.integrate(increments, rule, start, edges=time)
     steps = time[: len(attitude) * rule.samples : rule.samples]
-    remarks = [f"{place}: {len(increments)} samples over {steps[-1] - steps[0]:.6g} s with {rule.name}."]
+    remarks = [f"{len(increments)} samples over {steps[-1] - steps[0]:.6g} s with {rule.name}."]
     if left := len(increments) % rule.samples:
         remarks.append(f"Samples not used at the end, an incomplete step of {rule.samples}: {left}.")
     true = np.empty((0, 4)) if known is None else known[:: rule.samples][: len(attitude)]
