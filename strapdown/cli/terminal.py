@@ -95,8 +95,8 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
 
         @functools.wraps(function)
         def run(**values: Any) -> None:
-            given = (value for name, value in values.items() if name not in OUTPUTS)
-            paths = [path for value in given for path in (value if isinstance(value, list) else [value])]
+            inputs = (value for name, value in values.items() if name not in OUTPUTS)
+            paths = [path for value in inputs for path in (value if isinstance(value, list) else [value])]
             _running.update(
                 name=function.__name__, paths=[path for path in paths if isinstance(path, (str, Path))], tables=[]
             )
