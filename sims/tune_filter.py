@@ -78,11 +78,11 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         record=record,
     )
     if out is not None:
-        draw(result, Path(out), tuning.likelihood([train], before["too small"], FREE))
+        draw(result, Path(out))
     return result
 
 
-def draw(result, folder, objective):
+def draw(result, folder):
     """Write the figures: searches, slices, values against the truth, held-out innovations."""
     from strapdown import plots
     from strapdown.plots import tuning as drawing
@@ -96,7 +96,7 @@ def draw(result, folder, objective):
     values(result, right)
     plots.save(figure, folder / "tune_filter.png")
     plots.save(
-        drawing.likelihood_slices(tuning.slices(objective, tuned), tuned),
+        drawing.likelihood_slices(tuning.slices(tuned), tuned),
         folder / "tune_filter-likelihood.png",
     )
     plots.save(

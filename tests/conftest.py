@@ -116,11 +116,11 @@ def run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Callable[..., tuple[int, str, str]]:
     """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    from strapdown.cli import progress
+    from strapdown.cli import terminal
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        progress, "_quiet", True
+        terminal, "_quiet", True
     )  # standard error then contains only errors, even if kernels are compiled first
 
     def command(*arguments: object) -> tuple[int, str, str]:

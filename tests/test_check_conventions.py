@@ -14,7 +14,7 @@ from strapdown import motion, quaternion, recordings, vectors
 from strapdown.ahrs import check_conventions
 from strapdown.ahrs.check_conventions import AXES, FRAMES
 from strapdown.checks import Hint, InputError
-from strapdown.cli.progress import option
+from strapdown.cli.terminal import option
 from strapdown.recordings import Recording
 from strapdown.units import STANDARD_GRAVITY
 

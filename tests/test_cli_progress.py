@@ -8,16 +8,16 @@ import time
 import pytest
 from rich.console import Console
 
-from strapdown.cli import progress
+from strapdown.cli import terminal
 
 
 @pytest.fixture
 def said(monkeypatch):
     """Standard error as a file that is no terminal; lines come every tenth of a second."""
     text = io.StringIO()
-    monkeypatch.setattr(progress, "errors", Console(file=text, markup=False, highlight=False, width=200))
-    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.1)
-    monkeypatch.setattr(progress, "_quiet", False)
+    monkeypatch.setattr(terminal, "errors", Console(file=text, markup=False, highlight=False, width=200))
+    monkeypatch.setattr(terminal, "LINE_INTERVAL", 0.1)
+    monkeypatch.setattr(terminal, "_quiet", False)
     return text
 
 
@@ -26,7 +26,7 @@ def lines_of(text: io.StringIO) -> list[str]:
 
 
 def test_a_line_says_what_is_done_of_how_much(said):
-    with progress.progress_bar("runs", 30) as advance:
+    with terminal.progress_bar("runs", 30) as advance:
         advance(10)
         advanced = len(lines_of(said))
         for _ in range(1000):
@@ -40,39 +40,39 @@ def test_a_line_says_what_is_done_of_how_much(said):
 
 
 def test_a_search_says_what_it_is_at(said):
-    with progress.progress_bar("searches") as advance:
+    with terminal.progress_bar("searches") as advance:
         advance("searches: 1 of 4, 23 evaluations")
         time.sleep(0.15)
     assert set(lines_of(said)) == {"searches: 1 of 4, 23 evaluations: 0 s"}
 
 
 def test_a_step_of_unknown_length_prints_its_time(said):
-    with progress.progress_bar("smoothing"):
+    with terminal.progress_bar("smoothing"):
         time.sleep(0.15)
     assert set(lines_of(said)) == {"smoothing: 0 s"}
 
 
 def test_what_is_quick_says_nothing_and_quiet_says_nothing(said, monkeypatch):
-    with progress.progress_bar("quick", 1) as advance:
+    with terminal.progress_bar("quick", 1) as advance:
         advance(1)
-    monkeypatch.setattr(progress, "_quiet", True)
-    with progress.progress_bar("long", 2):
+    monkeypatch.setattr(terminal, "_quiet", True)
+    with terminal.progress_bar("long", 2):
         time.sleep(0.15)
     assert lines_of(said) == []
 
 
 def test_a_terminal_has_a_bar(monkeypatch):
     text = io.StringIO()
-    monkeypatch.setattr(progress, "errors", Console(file=text, force_terminal=True, width=100))
-    monkeypatch.setattr(progress, "_quiet", False)
-    with progress.progress_bar("runs", 3) as advance:
+    monkeypatch.setattr(terminal, "errors", Console(file=text, force_terminal=True, width=100))
+    monkeypatch.setattr(terminal, "_quiet", False)
+    with terminal.progress_bar("runs", 3) as advance:
         advance(2)
         time.sleep(0.3)
     assert "2/3" in text.getvalue()
 
 
 def test_a_fault_ends_the_progress(said):
-    with pytest.raises(ZeroDivisionError), progress.progress_bar("runs", 3):
+    with pytest.raises(ZeroDivisionError), terminal.progress_bar("runs", 3):
         _ = 1 / 0
     number = len(lines_of(said))
     time.sleep(0.25)
@@ -82,9 +82,9 @@ def test_a_fault_ends_the_progress(said):
 def test_quiet_may_stand_anywhere(succeeds, monkeypatch):
     heard = []
     for arguments in (("scenarios", "--quiet"), ("--quiet", "scenarios"), ("scenarios",)):
-        monkeypatch.setattr(progress, "_quiet", False)
+        monkeypatch.setattr(terminal, "_quiet", False)
         succeeds(*arguments)
-        heard.append(progress._quiet)
+        heard.append(terminal._quiet)
     assert heard == [True, True, False]
     assert sys.argv[-1] == "scenarios"
 
@@ -103,10 +103,8 @@ def test_json_on_standard_output_is_all_that_is_there(run, tmp_path):
 
 def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
     """Such as those that set its title, or hide the line before."""
-    from strapdown.cli.progress import PlainConsole
-
     name = "star\x1b]0;title\x07\x1b[2K\x9b1A\ttab"
-    PlainConsole(markup=False, highlight=False, soft_wrap=True).print(f"{name}: 1\n[red]2")
+    terminal.PlainConsole(markup=False, highlight=False, soft_wrap=True).print(f"{name}: 1\n[red]2")
     said = capsys.readouterr().out
     assert not {code for code in said if code not in "\t\n" and (ord(code) < 32 or 127 <= ord(code) < 160)}
     assert said.startswith("star\N{REPLACEMENT CHARACTER}]0;title")
@@ -114,7 +112,6 @@ def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
 
 
 def test_nor_do_those_of_a_table(capsys):
-    from strapdown.cli import terminal
     from strapdown.results import Table
 
     terminal.show(Table("run \x1b[2K", ("sensor\x1b[1A", "test"), [("star\x1b]0;x\x07", "pass")], left=2))

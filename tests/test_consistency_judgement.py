@@ -405,7 +405,7 @@ def test_check_judges_a_campaign(run, succeeds, plan, tmp_path):
     assert "innovations consistent; attitude and bias not testable from 20 runs: only an error of σ of ×2" in said
     campaign.run(plan, tmp_path / "runs.h5", runs=200)
     said = succeeds("check", "runs.h5", "--json", "check.json")
-    assert "200 of 200 runs" in said
+    assert "runs.h5: 200 runs of " in said
     assert json.loads((tmp_path / "check.json").read_text())["kind"] == "strapdown montecarlo"
 
 
@@ -417,5 +417,5 @@ def test_check_refuses_what_it_cannot_judge(run, refusal, tmp_path):
     assert "cannot be read as HDF5" in run("check", "text.h5")[2]
     records.write_attitude("attitude.h5", np.arange(2.0), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
     wrong = refusal("check", "attitude.h5")
-    assert "is a strapdown attitude" in wrong
+    assert "attitude.h5: result is AttitudeHistory; give an Estimate" in wrong
     assert "--filter goes with --record" in run("check", "attitude.h5", "--filter", "f.toml")[2]

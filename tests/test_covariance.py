@@ -799,7 +799,7 @@ def test_the_command_refuses_in_one_line(run):
     for arguments, word in (
         (("spin", "--consider", "star.delay"), "NAME=VALUE"),
         (("spin", "--consider", "sta.mounting=3"), "did you mean 'star.mounting'"),
-        (("spin", "--consider", "star.bias=x"), "'x' is no number"),
+        (("spin", "--consider", "star.bias=x"), "--consider star.bias is 'x'; give a number"),
         (("spin", "--consider", "scale_factor=-1"), "--consider scale_factor is -1"),
         (("nowhere",), "nowhere"),
     ):

@@ -259,13 +259,15 @@ def test_own_data_with_own_noise():
     np.testing.assert_array_equal(estimate.covariance, direct.covariance)
 
 
-def test_integrate_starts_at_the_truth():
+def test_integrate_starts_at_the_truth(tmp_path):
     record = sd.simulate(scenario(10.0))
-    time, attitude = sd.integrate(record, "one-sample")
-    np.testing.assert_array_equal(time, record.time)
-    error = sd.quaternion.angle_between(attitude, record.truth.attitude)
+    history = sd.integrate(record, "one-sample")
+    np.testing.assert_array_equal(history.time, record.time)
+    error = sd.quaternion.angle_between(history.attitude, record.truth.attitude)
+    assert history.remarks[-1].startswith(f"Error relative to the true attitude: final {np.degrees(error[-1]):.4g}°")
     assert error.max() < 1e-3  # at constant rate one sample is exact: what is left is noise and bias
     assert sd.integrate(record, initial_attitude=[1.0, 0.0, 0.0, 0.0]).attitude[0] == pytest.approx([1, 0, 0, 0])
+    assert sd.read(sd.write(history, tmp_path / "attitude.h5")) == history
 
 
 def test_files_are_recognised_by_their_content(tmp_path):

@@ -11,8 +11,7 @@ import typer
 import strapdown
 from strapdown.checks import Hint
 from strapdown.cli import register
-from strapdown.cli.progress import option
-from strapdown.cli.terminal import app
+from strapdown.cli.terminal import app, option
 
 PACKAGE = Path(strapdown.__file__).parent
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from functools import cache, partial
 from pathlib import Path
@@ -66,6 +67,13 @@ def test_the_file_holds_what_a_plain_run_gives(tmp_path):
     assert held.plan.digest == PLAN.digest
     assert (held.machine, held.chunk, held.runs, held.finished) == ("scalar", CHUNK, 21, True)
     assert list(tmp_path.rglob("*")) == [path.parent, path]
+
+
+def test_a_campaign_runs_in_any_thread(tmp_path):
+    """Only the main thread may handle signals."""
+    with ThreadPoolExecutor(1) as pool:
+        result = pool.submit(go, tmp_path / "c.h5", 4).result()
+    assert_same(result.statistics, straight(4))
 
 
 def test_the_file_describes_itself(tmp_path):

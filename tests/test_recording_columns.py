@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import columns, delimited, read
+from strapdown.recordings import delimited, read
 
 DEGREE = np.pi / 180.0
 G = 9.80665
@@ -126,7 +126,7 @@ def test_a_mapping_names_columns_and_units(table):
     path = table(ODD)
     with pytest.raises(InputError, match=r"lacks time.*it has: when, u1.*`columns={'time': "):
         read(path)
-    mapping = columns.parse_mapping("time=when[ms],gx=u3[dps],gy=u2,gz=u1,ax=f1[mg],ay=f2,az=f3")
+    mapping = {"time": "when[ms]", "gx": "u3[dps]", "gy": "u2", "gz": "u1", "ax": "f1[mg]", "ay": "f2", "az": "f3"}
     recording = read(path, columns=mapping)
     np.testing.assert_allclose(recording.time, VALUES[:, 0] * 1e-3, rtol=1e-15)
     np.testing.assert_allclose(recording.rate, VALUES[:, [3, 2, 1]] * DEGREE, rtol=1e-15)
@@ -137,17 +137,15 @@ def test_a_mapping_names_columns_and_units(table):
 @pytest.mark.parametrize(
     ("mapping", "words"),
     [
-        ("time", "'time' is not ROLE=NAME"),
+        ("time", "--columns is 'time'; give ROLE=NAME"),
         ("tme=when", "role 'tme' is not known; did you mean 'time'"),
         ("time=when,time=u1", "time is given twice"),
         ("time=then", "has no column 'then' for time"),
         ("time=when,gx=u1", "lacks gy, gz"),
     ],
 )
-def test_bad_mappings_are_refused(table, mapping, words):
-    with pytest.raises(InputError) as caught:
-        read(table(ODD), columns=columns.parse_mapping(mapping))
-    assert words in str(caught.value)
+def test_bad_mappings_are_refused(refusal, table, mapping, words):
+    assert words in refusal("integrate", table(ODD), "--columns", mapping)
 
 
 def test_two_sensors_that_fit_are_refused_not_chosen(table):

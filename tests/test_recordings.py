@@ -192,6 +192,9 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
     with pytest.raises(InputError, match="states its own rate; drop the option rate"):
         recordings.read_samples(path, "gyro", rate=100.0)
+    np.save(tmp_path / "gyro.npy", alone.rate)
+    with pytest.raises(InputError, match=r"gyro.npy is one array; leave `topic='/imu'` out"):
+        recordings.read_samples(tmp_path / "gyro.npy", units={"gyro": "rad/s"}, rate=100.0, topic="/imu")
     status = CliRunner().invoke(
         app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
     )

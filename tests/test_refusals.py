@@ -71,6 +71,8 @@ CAMPAIGN = ["montecarlo", "short.toml", "--runs"]
         (["tune", "record.h5", "--seed", -1, "--out", "new.toml"], "seed is -1"),
         (["tune", "record.h5", "--spacing", -1.0, "--out", "new.toml"], "spacing"),
         (["tune", "record.h5", "record.h5", "--out", "new.toml"], "given twice"),
+        (["tune", "record.h5", "--prior", "filter.toml", "--out", "filter.toml"], "the same file that is read"),
+        (["covariance", "short.toml", "--filter", "lines.json", "--tables", "lines.json"], "lines.json is a file"),
         (["estimate", "record.h5", "--every", 5000, "--out", "new"], "every is 5000, more than the 2000 filter steps"),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
@@ -422,7 +424,7 @@ def test_integration_reports_samples_that_fill_no_step(there, tmp_path):
     result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
     assert result.exit_code == 0, result.output
     assert "Samples not used at the end, an incomplete step of 4: 3." in result.output
-    assert "contains its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
+    assert "declares its own layout; leave `units=" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
 
 
 def test_want_of_memory_ends_with_one_line(run, monkeypatch):

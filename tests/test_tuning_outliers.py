@@ -280,7 +280,8 @@ def test_outliers_are_found_beside_correlated_noise_that_has_states():
     truth = {"star 1.sigma": 1e-4, "star 2.sigma": 2e-4}
     wrong = tuning.with_values(chosen, {name: 2.0 * value for name, value in truth.items()})
     one = tuning.record_case(scenarios.simulate(made, 4), chosen, seed=4)
-    found, _, gate = tuning.tune([one], wrong, tuple(truth), starts=1, gate=True)
+    found = tuning.tune([one], wrong, tuple(truth), starts=1, gate=True)
+    gate = found.gate
     for parameter, right in zip(found.parameters, [*truth.values(), 0.05, 10.0], strict=True):
         assert parameter.lower <= right <= parameter.upper, parameter
         assert parameter.standard_error < 0.2

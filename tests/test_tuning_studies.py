@@ -222,7 +222,7 @@ def test_innovations_of_a_recording_tune_the_scale_alone_and_leave_no_sigma_too_
     filter_setup = tuning.recording_setup()
     names, spacing = tuning.by_innovations(None)
     one = recorded(broad, slice(trial, trial + 1))
-    found = tuning.tune(one, filter_setup, names, spacing=spacing, starts=1).tuning.setup
+    found = tuning.tune(one, filter_setup, names, spacing=spacing, starts=1).setup
     after = tuning.compare(one, filter_setup, found).after
     assert 0.02 < np.nanmean(after.nees[0].mean) < 1.0
     np.testing.assert_allclose(rmse(one[0], found), rmse(one[0], filter_setup), rtol=1e-5)

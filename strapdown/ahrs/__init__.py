@@ -8,6 +8,7 @@ lost by updating at a lower rate than the sensors': the samples of a step are ro
 from __future__ import annotations
 
 from strapdown.ahrs import check_conventions as check_conventions
+from strapdown.ahrs.check_conventions import ConventionWarning
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.live import LiveAhrs
 from strapdown.ahrs.magnetic_field import FieldComparison, MagneticField
@@ -27,6 +28,7 @@ __all__ = [
     "MOTIONS",
     "AhrsEstimate",
     "AhrsParameters",
+    "ConventionWarning",
     "FieldComparison",
     "LiveAhrs",
     "MagneticField",

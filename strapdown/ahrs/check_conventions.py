@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -195,6 +196,16 @@ class Examination:
             Fields of the examination.
         """
         return plain(asdict(self))  # type: ignore[no-any-return]
+
+
+class ConventionWarning(UserWarning):
+    """Axes, signs or units of a recording seem wrong."""
+
+
+def warn(source: Recording) -> None:
+    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
+    for words in examine(source).warnings:
+        warnings.warn(f"{source.source}: {words}", ConventionWarning, stacklevel=3)
 
 
 def examine(recording: Recording) -> Examination:

@@ -153,12 +153,17 @@ class NoiseFit(Listed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about axes with other errors than the noise terms, one sentence each."""
-        return tuple(
+        """Warnings about axes with other errors than the noise terms, one sentence each, and what to do."""
+        sentences = [
             f"axis {'xyz'[axis]} has other errors than these noise terms: {what} (probability {max(probability, 1e-99):.0e})"
             for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
             if probability < MISFIT_PROBABILITY
+        ]
+        remedy = (
+            f"do not trust these intervals: cut the recording to an interval where the {self.sensor} is at rest, or exclude the band of a "
+            "filter by the highest frequency of the fit"
         )
+        return (*sentences, remedy) if sentences else ()
 
     def listing(self) -> Table:
         """Return the coefficients with their intervals, as a table."""

@@ -71,10 +71,6 @@ def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
     return {sensor: {key(sensor, term)[0]: value.tolist() for term, value in rounded.items()}}
 
 
-DISTRUST = "do not trust these intervals"
-"""Warning for a record with other errors than the noise terms."""
-
-
 def to_specification(fit: NoiseFit, source: str) -> str:
     """Return the text of ``gyro.toml``, or that of another sensor: terms detected, and as comments bounds of the others and warnings.
 
@@ -95,8 +91,6 @@ def to_specification(fit: NoiseFit, source: str) -> str:
     sensor = fit.sensor
     lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
     lines += [f"WARNING: {warning}." for warning in fit.warnings]
-    if fit.warnings:
-        lines.append(f"WARNING: {DISTRUST}, nor this file.")
     text = commented(lines) + "\n" + tomli_w.dumps(to_toml(fit))
     partly, wholly = [], []
     for term, bound in noise_fit.upper_bounds(fit).items():

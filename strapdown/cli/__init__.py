@@ -4,8 +4,7 @@ A result replaces an earlier result of the same name completely. ``estimate``, `
 that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
 - ``terminal``: Functions shared by all commands.
-- ``progress``: Progress of long computations.
-- ``reading``: Options of every command that reads a recording.
+- ``options``: Options of several commands.
 
 The other modules define the commands that :data:`COMMANDS` assigns to them.
 """
@@ -24,8 +23,7 @@ from typing import Any
 import typer
 
 from strapdown.checks import OF_YOUR_OWN, InputError
-from strapdown.cli.progress import be_quiet, errors
-from strapdown.cli.terminal import app, console
+from strapdown.cli.terminal import app, be_quiet, console, errors
 
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {
@@ -93,10 +91,12 @@ def _about(
 
 def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
     """Print a warning of this package in one line, without its place in the code."""
-    if category.__module__.startswith("strapdown."):
-        errors.print(f"warning: {message}", soft_wrap=True)
-    else:
+    if not category.__module__.startswith("strapdown."):
         usual(message, category, *place)
+    elif category.__name__ == "ConventionWarning":
+        console.print(f"warning: {message}. See `strapdown doctor`, with the same file and its options.")
+    else:
+        errors.print(f"warning: {message}", soft_wrap=True)
 
 
 FAULT = 70
@@ -115,15 +115,13 @@ def main() -> None:
     try:
         register(next((argument for argument in sys.argv[1:] if not argument.startswith("-")), None))
         app(standalone_mode=True)
+        return
     except InputError as error:
-        errors.print(f"error: {error}", soft_wrap=True)
-        sys.exit(2)
+        status, words = 2, f"{error}"
     except OSError as error:
-        errors.print(f"error: {error}; check the path and the space left", soft_wrap=True)
-        sys.exit(2)
+        status, words = 2, f"{error}; check the path and the space left"
     except MemoryError as error:
-        errors.print(f"error: not enough memory ({error}); shorten the record, or lower the rates", soft_wrap=True)
-        sys.exit(2)
+        status, words = 2, f"not enough memory ({error}); shorten the record, or lower the rates"
     except KeyboardInterrupt:
         errors.print("interrupted")
         sys.exit(130)
@@ -131,15 +129,13 @@ def main() -> None:
         import strapdown
 
         traceback.print_exc()
+        status, words = (
+            FAULT,
+            f"internal error of strapdown {strapdown.__version__} ({type(error).__name__}), not a verdict and not bad input; please report "
+            "the traceback above with the command",
+        )
         for note in getattr(error, "__notes__", ()):
             if OF_YOUR_OWN in note:
-                errors.print(
-                    f"error: {note} ({type(error).__name__}); see the end of the traceback above", soft_wrap=True
-                )
-                sys.exit(2)
-        errors.print(
-            f"error: internal error of strapdown {strapdown.__version__} ({type(error).__name__}), not a verdict and not bad input; "
-            "please report the traceback above with the command",
-            soft_wrap=True,
-        )
-        sys.exit(FAULT)
+                status, words = 2, f"{note} ({type(error).__name__}); see the end of the traceback above"
+    errors.print(f"error: {words}", soft_wrap=True)
+    sys.exit(status)

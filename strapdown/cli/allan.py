@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from typer import Argument, Option
 
 import strapdown as sd
 from strapdown.checks import InputError, count, one_of, positive
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Samples
-from strapdown.files import plain, write_json, write_text
-
-if TYPE_CHECKING:
-    from strapdown.allan import NoiseFit
+from strapdown.cli.options import FORMAT, RECORDING_HELP, Format, Samples
+from strapdown.files import plain, reading, write_json, write_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +34,7 @@ class _Output:
     """Output."""
 
     out: Path = Option(Path("allan-results"), help="Folder for gyro.toml, allan.json and the figure.")
-    form: ui.Format = ui.FORMAT
-    tables: Path | None = ui.TABLES
+    form: Format = FORMAT
     kalibr: bool = Option(False, "--kalibr", help="Also write imu.yaml; needs gyro and accelerometer.")
     factor: float = Option(1.0, help="Factor on the noise in imu.yaml, usually 5 to 10.")
     px4: bool = Option(False, "--px4", help="Also write px4.params of EKF2; needs gyro and accelerometer.")
@@ -53,7 +47,7 @@ class _Output:
         return [self.out / name for name in names]
 
 
-@ui.command
+@ui.command("tables")
 def allan(
     *,
     recording: Path = Argument(help=f"Sensor at rest: simulated record (HDF5), NPY. {RECORDING_HELP}."),
@@ -71,20 +65,16 @@ def allan(
     if options.temperature is not None:
         count("--temperature", options.temperature)
     kalibr = {"factor": output.factor, "topic": samples.topic or "/imu0"}
-    exports: dict[Path, Any] = {}
+    exports = {}
     for name, wanted, to, more in (
-        ("imu.yaml", output.kalibr, "to_kalibr", kalibr),
-        ("px4.params", output.px4, "to_px4", {}),
-        ("imu_sensor.m", output.matlab, "to_matlab", {}),
+        ("imu.yaml", output.kalibr, sd.allan.parameters.to_kalibr, kalibr),
+        ("px4.params", output.px4, sd.allan.parameters.to_px4, {}),
+        ("imu_sensor.m", output.matlab, sd.allan.parameters.to_matlab, {}),
     ):
         if wanted:
-            exports[output.out / name] = partial(getattr(sd.allan.parameters, to), source=recording.name, **more)
-    own = [file for sensor in sensors for file in output.files(sensor)]
-    ui.check_files(*own, *exports, tables=output.tables, sources=(recording,))
-    # For simulated records and arrays the reader raises errors for options that do not apply.
-    plain_units = recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None)
-    layout = {"units": samples.units} if plain_units else samples.options(recording)
-    fits = {sensor: _identify(recording, sensor, layout, options, output) for sensor in sensors}
+            exports[output.out / name] = partial(to, source=recording.name, **more)
+    ui.check_files(*(file for sensor in sensors for file in output.files(sensor)), *exports)
+    fits = {sensor: _identified(recording, sensor, samples, options, output) for sensor in sensors}
     for file, text in exports.items():
         write_text(file, text(fits))
     ui.written(*exports)
@@ -92,47 +82,38 @@ def allan(
         ui.say(f"imu.yaml has the maximum over the axes times {output.factor:g} (--factor).")
 
 
-def _identify(
-    recording: Path, sensor: str, layout: dict[str, Any], options: _Identification, output: _Output
-) -> NoiseFit:
+def _identified(
+    recording: Path, sensor: str, samples: Samples, options: _Identification, output: _Output
+) -> sd.allan.NoiseFit:
     """Identify the noise of one sensor; print and write the results."""
+    source = sd.recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **samples.options)
     specification, numbers, drawing, warm = output.files(sensor)
-    source = sd.recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **layout)
-    interval, values, temperature = source.sample_interval, source.values, ""
-    gaps = bool(np.isnan(values).any())
-    try:
+    paths, number = [specification, numbers], len(source.values)
+    with reading.from_file(recording):
         if options.temperature is not None:
-            values, listing, temperature = sd.allan.temperature.regressed(source, sensor, options.temperature)
-            ui.show(listing)
+            left, table, temperature = sd.allan.temperature.regressed(source, sensor, options.temperature)
+            source = replace(source, values=left)
+            ui.show(table)
         with ui.progress_bar("fit, deviation, figure"):
-            highest = options.highest_frequency
-            fit = sd.allan.fit_noise(values, interval, kind=source.kind, sensor=sensor, highest_frequency=highest)
-            deviation = sd.allan.allan_deviation(values, interval, kind=source.kind)
+            fit = sd.fit_noise(source, sensor=sensor, highest_frequency=options.highest_frequency)
+            deviation = sd.allan_deviation(source, sensor=sensor)
             figure = sd.plots.allan_overview(deviation, fit)
-    except InputError as error:
-        raise InputError(f"{recording.name}: {error}") from None
-    length = f"{len(values)} samples at {1.0 / interval:.6g} Hz, {len(values) * interval / 3600.0:.3g} h"
-    ui.say(f"{recording.name}: {length}.", *source.remarks)
-    if gaps:
-        shortest = sd.allan.noise_fit.SHORTEST
+    dt = source.sample_interval
+    length = f"{recording.name}, {number} samples at {1.0 / dt:.6g} Hz, {number * dt / 3600.0:.3g} h"
+    ui.say(f"{length}.", *source.remarks)
+    if fit.samples < number:
         ui.say(
-            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses averages that have "
-            "most of their samples."
+            f"Because of gaps the fit uses {fit.samples} samples in segments of {sd.allan.noise_fit.SHORTEST} or more; the deviation uses "
+            "averages that have most of their samples."
         )
-    table = fit.listing()
-    ui.show(table, title=f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
+    ui.show(fit.listing(), notes=False)
     ui.say("For a term not detected in this record, the last column is an upper bound.")
-    write_text(specification, sd.allan.parameters.to_specification(fit, f"{recording.name}, {length}"))
-    unit = sd.allan.temperature.UNITS[sensor][1]
-    curve = {"tau_s": deviation.taus, f"deviation_{unit}": deviation.deviation}
+    write_text(specification, sd.allan.parameters.to_specification(fit, length))
+    curve = {"tau_s": deviation.taus, f"deviation_{sd.allan.temperature.UNITS[sensor][1]}": deviation.deviation}
     write_json(numbers, plain({"source": recording.name, **fit.summary(), **curve}))
-    if temperature:
+    if options.temperature is not None:
         write_text(warm, temperature)
-    figures = sd.plots.save_as({drawing: figure}, output.form)
-    ui.written(specification, numbers, *([warm] if temperature else []), *figures, tables=(output.tables, [table]))
+        paths.append(warm)
+    ui.written(*paths, *sd.plots.save_as({drawing: figure}, output.form))
     ui.say(*(f"warning: {warning}" for warning in fit.warnings))
-    if fit.warnings:
-        distrust = f"warning: {sd.allan.parameters.DISTRUST}, nor {specification.name}."
-        remedy = f"Cut the recording to an interval where the {sensor} is at rest, or exclude the band of a filter by --highest-frequency."
-        ui.say(remedy, distrust)
     return fit

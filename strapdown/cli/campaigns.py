@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
 from typer import Argument, Option
 
 import strapdown as sd
 from strapdown.checks import InputError, count
 from strapdown.cli import terminal as ui
-from strapdown.cli.progress import rate_text
+from strapdown.cli.options import GYRO, SCENARIO, STATES, options_given
 from strapdown.files import write_json
 
 if TYPE_CHECKING:
-    from strapdown.estimation.filters.own import Own
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
 
-_RUNS = 1000
 _SUFFIXES = (".h5", ".hdf5")
 
 
@@ -37,13 +32,13 @@ class _Model:
         help="TOML with a table named filter, as of `strapdown tune`; or FILE.py:NAME, your own filter, which is executed. Default: a "
         "matched one.",
     )
-    gyro: Path | None = ui.GYRO
+    gyro: Path | None = GYRO
     dispersions: Path | None = Option(
         None,
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
-    states: bool | None = ui.STATES
+    states: bool | None = STATES
 
 
 @dataclass(frozen=True)
@@ -64,18 +59,17 @@ class _Computing:
     overwrite: bool = Option(False, "--overwrite", help="Start from the beginning even if the file exists.")
 
 
-@ui.command
+@ui.command("tables")
 def montecarlo(
     *,
-    scenario: str = Argument(help=f"{ui.SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
+    scenario: str = Argument(help=f"{SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
     model: _Model,
     computing: _Computing,
     out: Path | None = Option(None, help="HDF5 file. Default: NAME-montecarlo.h5 with the name of the scenario."),
     replay: int | None = Option(None, help="Repeat this run and write its record and estimate."),
-    tables: Path | None = ui.TABLES,
-) -> None:
+) -> dict[str, Any] | None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
-    source, again = Path(scenario), computing.resume or computing.overwrite
+    source = Path(scenario)
     held, plan = _planned(source, scenario, model)
     if held is not None and computing.machine == "auto":
         computing = replace(computing, machine=held.machine)
@@ -85,60 +79,54 @@ def montecarlo(
         raise InputError("--resume and --overwrite exclude each other; give one of them")
     if beside.exists() and not target.exists() and not computing.overwrite and replay is None:
         raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    ui.check_files(target, suffixes=_SUFFIXES)
-    ui.check_files(beside, tables=tables)
+    ui.check_files(target, suffixes=_SUFFIXES, reads=False)
+    ui.check_files(beside)
     if replay is not None:
         _replay(plan, replay, computing.machine, target)
-        return
-    if held is not None and target == source and not again:
-        status, _, listed = _print_result(held)
-        ui.written(tables=(tables, listed))
-    else:
-        status, content, listed = _print_result(_computed(plan, target, source.stem, computing))
+        return None
+    new = held is None or target != source or computing.resume or computing.overwrite
+    result = _computed(plan, target, source.stem, computing) if new else held
+    content = _shown(result)
+    if new:
         write_json(beside, content)
-        ui.written(target, beside, tables=(tables, listed))
-    raise typer.Exit(status)
+        ui.written(target, beside)
+    return {"verdict": content["judgement"]["verdict"]}
 
 
-def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | None, Plan]:
+def _planned(source: Path, scenario: str, model: _Model) -> tuple[Any, Plan]:
     """Return the campaign of a file, None if the source is no campaign file, and the plan."""
     from strapdown import workflows
+    from strapdown.estimation.filters.own import read_filter
     from strapdown.estimation.setup import read_setup
     from strapdown.montecarlo import campaign as campaigns
     from strapdown.workflows import filters
 
-    own = _own_filter(model.filter_file)
+    place: Path | None = model.filter_file
+    setup: Any = None
+    own = place is not None and (place.suffix == ".py" or ".py:" in place.name)
+    if place is not None and own:
+        ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
+        setup = read_filter(place)
     if source.suffix.lower() in _SUFFIXES:
         held = campaigns.read(source)
-        if own is not None:
-            held, model = campaigns.with_filter(held, own, source), replace(model, filter_file=None)
-        for name in ui.options_given(model):
+        if own:
+            held, model = campaigns.with_filter(held, setup, source), replace(model, filter_file=None)
+        for name in options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
-    from_file = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
     plan = workflows.plan(
         sd.scenarios.load_scenario(scenario),
         gyro=None if model.gyro is None else sd.gyro.read_spec(model.gyro),
-        setup=from_file if own is None else own,
+        setup=read_setup(place) if place is not None and setup is None else setup,
         seed=model.seed,
         states=model.states,
         dispersions=None if model.dispersions is None else sd.montecarlo.read_dispersions(model.dispersions),
     )
-    if model.states is None and model.filter_file is None and plan.setup.states is not None:
+    if model.states is None and place is None and plan.setup.states is not None:
         ui.say(filters.state_words(plan.setup.states.names))
     if plan.individuals:
         ui.say("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
     return None, plan
-
-
-def _own_filter(place: Path | None) -> Own | None:
-    """Return the filter of a Python file, ``FILE.py:NAME``, which is executed; None for any other file."""
-    from strapdown.estimation.filters.own import read_filter
-
-    if place is None or not (place.suffix == ".py" or ".py:" in place.name):
-        return None
-    ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
-    return read_filter(place)
 
 
 def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campaign:
@@ -147,11 +135,10 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
 
     runs = options.runs
     if runs is None:
-        runs = campaigns.read(target).runs if options.resume and target.exists() else _RUNS
+        runs = campaigns.read(target).runs if options.resume and target.exists() else 1000
     choice = sd.montecarlo.choose(plan, options.machine)
     count("runs", runs)
-    sd.montecarlo.in_threads(options.threads)  # checks the number
-    ui.say(f"{plan.scenario.name or name}: {ui.counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
+    ui.say(f"{plan.scenario.name or name}: {runs} run{'' if runs == 1 else 's'}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         workers = None
         if options.workers is not None or options.cluster is not None:
@@ -160,82 +147,38 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
             client = stack.enter_context(dask_client(workers=options.workers, address=options.cluster))
             workers = on_dask(client)
             ui.say(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
-        stop_if_asked = stack.enter_context(asked_to_stop())
         advance = stack.enter_context(ui.progress_bar("runs", runs))
-
-        def advanced(number: int) -> None:
-            advance(number)
-            stop_if_asked()
-
         how = {name: getattr(options, name) for name in ("resume", "overwrite", "chunk", "machine", "threads")}
         try:
-            return campaigns.run(plan, target, runs=runs, workers=workers, progress=advanced, **how)
+            return campaigns.run(plan, target, runs=runs, workers=workers, progress=advance, **how)
         except KeyboardInterrupt:
             ui.say(f"The completed runs are in {target}; continue with --resume.")
             raise
 
 
-@contextlib.contextmanager
-def asked_to_stop() -> Iterator[Callable[[], None]]:
-    """Treat SIGTERM, which batch systems send before they kill a process, as Ctrl-C, so that completed runs are written.
-
-    Yields a function that raises again after a signal: Python drops an exception that is raised while a weak reference is cleared.
-    """
-    asked = False
-
-    def ask(number: int, frame: Any) -> None:
-        nonlocal asked
-        asked = True
-        raise KeyboardInterrupt
-
-    def again() -> None:
-        if asked:
-            raise KeyboardInterrupt
-
-    heeded = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, ask) for number in heeded}
-    try:
-        yield again
-    finally:
-        for heeded_signal, handler in before.items():
-            signal.signal(heeded_signal, handler)
-
-
-def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Any]]:
-    """Print the statistics and the verdict of `strapdown check`; return the exit status, the content of the JSON file, and the tables."""
+def _shown(campaign: Campaign) -> dict[str, Any]:
+    """Print the statistics and the verdict of `strapdown check`; return the content of the JSON file."""
     from strapdown.estimation.setup import MEKF
-    from strapdown.montecarlo.verdicts import bound_of, tables
+    from strapdown.montecarlo.verdicts import tables
 
-    if campaign.statistics is None:
-        raise InputError("no chunk of the campaign is completed; continue it with --resume")
-    if not campaign.finished:
-        ui.say(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
-    report = sd.montecarlo.summary(campaign.statistics, bound=bound_of(campaign.plan))
-    judgement = sd.check(campaign)
-    listed = tables(report)
-    ui.show(*listed)
-    ui.say("Use --replay to examine a run.")
-    rate = ""
-    if campaign.seconds > 0.0:
-        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
+    judgement, content, seconds = sd.check(campaign), campaign.summary(), campaign.seconds
+    ui.show(*tables(content))
+    rate = f" ({ui.rate_text(content['runs'] / seconds)} runs/s, including compilation)" if seconds > 0.0 else ""
     ui.say(
-        f"{ui.counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
-        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['confidence_level']:g} %."
+        "Use --replay to examine a run.",
+        f"{campaign.extent}, {seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} statistics of `strapdown check`: a "
+        f"consistent filter passes with {100.0 * judgement.confidence_level:g} %.",
+        judgement.words,
     )
-    ui.say(judgement.words)
     if judgement.verdict == "cannot tell":
         ui.say("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         ui.say("--states adds states for most of these errors to the filter.")
-    return (
-        ui.STATUS.get(judgement.verdict, ui.CANNOT_TELL),
-        {**campaign.summary(), "judgement": judgement.summary(), **report},
-        listed,
-    )
+    return content
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-
+    """Repeat a run, and write its record and its estimate."""
     paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
     ui.check_files(*paths)
     again = sd.montecarlo.replay(plan, run, machine=machine)

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError, array, non_negative, one_of
+from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.files import reading, writable, write_json
+from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers, options_given
+from strapdown.files import write_json
 
-if TYPE_CHECKING:
-    from strapdown.records import Estimate
-    from strapdown.workflows import Run
-
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml")
-"""Files that the command may write to its folder, in addition to figures."""
-FIGURES = ("estimate", "errors", "states")
-"""Figures that it may write there, without the suffix of their format."""
+FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml", *FIGURES)
+"""Files that the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """Files that other commands write there about an estimate."""
 
@@ -30,7 +25,7 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 class _Shared:
     """Filter."""
 
-    gyro: Path | None = ui.GYRO
+    gyro: Path | None = GYRO
     gate: float | None = Option(None, help="Reject measurements beyond this quantile of chi-squared, and recover.")
     robust: str | None = Option(None, help="Weight measurements by their innovations: huber or student.")
     full_covariance: bool | None = Option(
@@ -39,45 +34,17 @@ class _Shared:
     observability: bool = Option(False, "--observability", help="Report the observability of each state.")
     smooth: bool = Option(False, "--smooth", help="Also use the samples after each time (fixed-interval smoother).")
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        noise = self.gyro and sd.gyro.read_spec(self.gyro)
-        plain = {name: getattr(self, name) for name in ("gate", "robust", "smooth", "full_covariance")}
-        return plain | {"noise": noise}
-
 
 @dataclass(frozen=True, eq=False)
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Path | None = ui.FILTER
-    states: bool | None = ui.STATES
+    filter_file: Path | None = FILTER
+    states: bool | None = STATES
     state: list[str] | None = Option(None, help="Only this state, such as gyro.scale or SENSOR.bias; repeatable.")
     attitude: str | None = Option(None, help="Initial attitude, w,x,y,z. Default: from the first measurements.")
     from_truth: bool = Option(False, "--from-truth", help="Start from the truth with errors drawn from the filter's σ.")
     every: int = Option(1, help="Store every n-th filter step.")
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        from strapdown.estimation.setup import read_setup
-
-        setup = self.filter_file and read_setup(self.filter_file)
-        states: Any = self.state or self.states
-        return {"setup": setup, "states": states, "initial": self.initial, "every": self.every}
-
-    @property
-    def initial(self) -> Any:
-        """Initial state, as :func:`strapdown.estimate` takes it."""
-        if self.attitude is not None and self.from_truth:
-            raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
-        if self.attitude is None:
-            return "truth" if self.from_truth else None
-        try:
-            return array("--attitude", [float(part) for part in self.attitude.split(",")], (4,))
-        except ValueError:  # of which InputError is one
-            raise InputError(f"--attitude is {self.attitude!r}; give four numbers w,x,y,z") from None
 
 
 @dataclass(frozen=True)
@@ -105,25 +72,8 @@ class _Recorded:
             return None
         if self.place is None or self.date is None:
             raise InputError("--place and --date go together: the field drifts; give both")
-        try:
-            latitude, longitude, *height = (float(part) for part in self.place.split(","))
-        except ValueError:
-            latitude, longitude, *height = (0.0,) * 4
-        if len(height) > 1:
-            raise InputError(f"--place is {self.place!r}; give LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT")
-        return sd.ahrs.MagneticField.at(latitude, longitude, *height, date=self.date)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`strapdown.estimate`."""
-        one_of("--motion", self.motion or "hand", sd.ahrs.MOTIONS)
-        late = self.latency
-        return {
-            "motion": self.motion,
-            "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
-            "calibration": self.calibration and sd.calibration.read(self.calibration),
-            "temperature": self.temperature and sd.gyro.temperature.read(self.temperature),
-        }
+        place = numbers("--place", self.place, "LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT", 2, 3)
+        return sd.ahrs.MagneticField.at(*place, date=self.date)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +87,47 @@ class _Output:
     euler: str | None = Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = Option(None, help="With --to: fixed frame, enu (default) or ned; body axes are not changed.")
     figures: bool = Option(False, "--figures", help="Draw the estimate, its states and errors; --format does too.")
-    form: ui.Format | None = Option(None, "--format", help=ui.FORMAT.help)
+    form: Format | None = Option(None, "--format", help=FORMAT.help)
+
+    def exports(self, recording: Path, *, changed: bool, simulated: bool) -> dict[Path, dict[str, Any]]:
+        """Return the additional files with the options of their writers; raise an error for those that cannot be written."""
+        wanted = {"sequence": self.euler, "frame": self.frame and self.frame.upper()}
+        wanted = {name: value for name, value in wanted.items() if value is not None}
+        if wanted and not self.to:
+            raise InputError("--euler and --frame go with --to FILE; give the file")
+        exports: dict[Path, dict[str, Any]] = {}
+        for target in self.to or ():
+            ui.check_files(target, name="to")
+            form = sd.recordings.estimate_format(target, wanted, recording=not simulated)
+            # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
+            copied = "source" in form.estimate_options and sd.recordings.format_of(recording) is form and not changed
+            exports[target] = wanted | ({"source": recording} if copied else {})
+        return exports
 
 
-@ui.command
+def _options(shared: _Shared, specified: _Specified, recorded: _Recorded) -> dict[str, Any]:
+    """Return the options of :func:`strapdown.estimate`."""
+    initial: Any = "truth" if specified.from_truth else None
+    if specified.attitude is not None:
+        if specified.from_truth:
+            raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
+        initial = numbers("--attitude", specified.attitude, "four numbers w,x,y,z", 4)
+    late = recorded.latency
+    return {
+        "noise": shared.gyro and sd.gyro.read_spec(shared.gyro),
+        **{name: getattr(shared, name) for name in ("gate", "robust", "smooth", "full_covariance")},
+        "setup": specified.filter_file and sd.estimation.setup.read_setup(specified.filter_file),
+        "states": specified.state or specified.states,
+        "initial": initial,
+        "every": specified.every,
+        "motion": recorded.motion,
+        "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
+        "calibration": recorded.calibration and sd.calibration.read(recorded.calibration),
+        "temperature": recorded.temperature and sd.gyro.temperature.read(recorded.temperature),
+    }
+
+
+@ui.command()
 def estimate(
     *,
     recording: Path = Argument(help=f"{RECORDING_HELP}; or a record of `strapdown simulate`."),
@@ -158,108 +145,48 @@ def estimate(
     from strapdown.workflows.estimating import run as run_filter
 
     out, form = output.out, output.form or ("png" if output.figures else None)
-    names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
-    inputs = (recording, shared.gyro, specified.filter_file, recorded.calibration, recorded.temperature)
-    kind = lambda path: reading.kind(path) == "strapdown estimate"  # noqa: E731
-    ui.check_files(*(out / name for name in names), sources=inputs, own=kind, command="estimate")
-    exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
+    ui.check_files(*(out / name for name in FILES), own="strapdown estimate")
     simulated = sd.recordings.is_record(recording)
-    for name in ui.options_given(recorded if simulated else specified):
+    exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
+    for name in options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
-    options = shared.options | (specified.options if simulated else recorded.options)
-    field = recorded.field
+    options, field = _options(shared, specified, recorded), recorded.field
     with ui.progress_bar("reading"):
-        source: Any = sd.read(recording, **layout.options(recording))
+        source: Any = sd.read(recording, **layout.options)
+    if field is not None and source.magnetic_field is None:
+        raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
     if not simulated:
-        if field is not None and source.magnetic_field is None:
-            raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
-        ui.warn_about_conventions(source, recording)
+        sd.ahrs.check_conventions.warn(source)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = run_filter(source, walks=shared.observability, **options)
+    result = run.estimate if field is None else field.to_true_north(run.estimate)
+    ui.say(*result.remarks)
+    ui.show(result.listing())
+    parts: dict[str, Any] = {}
+    if shared.observability:
+        with ui.progress_bar("observability"):
+            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
+    if result.truth is not None:
+        parts["errors.json"] = sd.accuracy(result)
+    ui.show(*(part.listing() for part in parts.values()))
     if field is not None:
-        run = run._replace(estimate=field.to_true_north(run.estimate))
-    if simulated:
-        vectors = ", ".join(f"{len(series.time)} of {series.sensor}" for series in source.vectors) or "no measurements"
-        length = source.time[-1] - source.time[0]
-        ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
-    ui.say(*run.estimate.remarks)
-    ui.show(run.estimate.listing())
-    figures = (f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf", "svg"))
-    for name in (*FILES[1:], *figures, *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
+        parts["field.json"] = field.compared(source, result)
+        ui.say(str(parts["field.json"]))
+    contents = {file: part.summary() for file, part in parts.items()}
+    if result.error_states:
+        contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
+    for name in (*FILES[1:], *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
-    contents = _shown(run, observability=shared.observability)
-    if field is not None:
-        compared = field.compared(source, run.estimate)
-        ui.say(str(compared))
-        contents["field.json"] = compared.summary()
-    paths = [sd.write(run.estimate, out / FILES[0])]
+    paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():
         write_json(out / file, {"source": recording.name, **content})
         paths.append(out / file)
     if run.calibration is not None:
         paths.append(out / "calibration.toml")
         sd.calibration.write(run.calibration, paths[-1])
-    for target, how in exports.items():
-        paths.append(sd.write(run.estimate, target, recording=None if simulated else source, **how))
+    paths += [sd.write(result, to, recording=None if simulated else source, **how) for to, how in exports.items()]
     if form is not None:
-        paths += _drawn(out, form, run.estimate, recording.name)
+        paths += sd.plots.draw_estimate(result, out, form, title=recording.name)
     ui.written(*paths)
-    if run.estimate.innovations:
-        ui.say(f"Test the filter with `strapdown check {paths[0]}`.")
-
-
-def _shown(run: Run, *, observability: bool) -> dict[str, Any]:
-    """Print observability and errors of an estimate; return these and its error states as contents of JSON files."""
-    from strapdown.estimation import setup
-
-    contents: dict[str, Any] = {}
-    if run.estimate.error_states:
-        contents["states.json"] = {name: states.summary() for name, states in run.estimate.error_states.items()}
-    if observability:
-        with ui.progress_bar("observability"):
-            analysis = setup.observability(run.record, run.setup, run.initial)
-        ui.say(str(analysis))
-        contents["observability.json"] = analysis.summary()
-    if run.estimate.truth is not None:
-        accuracy = sd.accuracy(run.estimate)
-        ui.show(accuracy.listing())
-        contents["errors.json"] = accuracy.summary()
-    return contents
-
-
-def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, dict[str, Any]]:
-    """Return the additional files of an estimate with the options of their writers; raise an error for those that cannot be written."""
-    from strapdown.records import outputs
-
-    frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
-    if output.euler is not None:
-        outputs.euler([[1.0, 0.0, 0.0, 0.0]], output.euler)
-    wanted = {name: value for name, value in (("sequence", output.euler), ("frame", frame)) if value is not None}
-    if wanted and not output.to:
-        raise InputError("--euler and --frame go with --to FILE; give the file")
-    exports = {}
-    for target in output.to or ():
-        writable("to", target, sources=(recording,))
-        file_format = sd.recordings.estimate_format(target, wanted, recording=not sd.recordings.is_record(recording))
-        exports[target] = dict[str, Any](wanted)
-        # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
-        if (
-            "source" in file_format.estimate_options
-            and sd.recordings.format_of(recording) is file_format
-            and not changed
-        ):
-            exports[target]["source"] = recording
-    return exports
-
-
-def _drawn(out: Path, form: ui.Format, result: Estimate, title: str) -> list[Path]:
-    """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
-    truth = result.truth
-    figures = {out / "estimate": sd.plots.estimate_overview(result, title=title, fixed_frame=result.fixed_frame)}
-    if result.error_states:
-        figures[out / "states"] = sd.plots.states_over_time(result, title=title)
-    if truth is not None and truth.has_bias:
-        figures[out / "errors"] = sd.plots.error_overview(result, truth, title=title)
-    elif truth is not None:
-        figures[out / "errors"] = sd.plots.recording_errors(result, truth.attitude, truth.movement)
-    return sd.plots.save_as(figures, form)
+    if result.innovations:
+        ui.say(f"Test the filter with `strapdown check {out / FILES[0]}`.")

@@ -8,11 +8,10 @@ from typing import Any, Literal
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
 
 
-@ui.command
+@ui.command()
 def export(
     filter_file: str = Argument(
         metavar="FILTER",
@@ -28,21 +27,17 @@ def export(
     out: Path = Option(Path("strapdown-filter"), help="Folder of the source code."),
 ) -> None:
     """Export a filter as source code for a microcontroller or a web page."""
-    from strapdown.records import ImuRecord
-
-    source: Any = None
+    source: Any = sensors
     if sensors is not None:
         recorded = Path(sensors).suffix in (".h5", ".csv")
         source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
-        if not isinstance(source, (ImuRecord, sd.Scenario)):
-            raise InputError(f"{sensors} is no simulated record; give a record of `strapdown simulate`, or a scenario")
     paths = sd.export(filter_file, source, folder=out, rate=rate, magnetometer=magnetometer, to=to, precision=precision)
     what = f"an IMU at {rate:g} Hz" if sensors is None else f"the sensors of {sensors}"
     ui.say(f"Filter of {filter_file} with {what}, {precision} precision.")
     ui.written(*paths)
 
 
-@ui.command
+@ui.command()
 def info() -> None:
     """Print the versions and the processor features used by compiled code."""
     from strapdown.kernels.machine import describe

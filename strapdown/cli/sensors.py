@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from typer import Argument, Option
 
 import strapdown as sd
 from strapdown.cli import terminal as ui
+from strapdown.cli.options import SCENARIO
 
 
-@ui.command
+@ui.command()
 def scenarios(
     name: str | None = Argument(None, help="Built-in scenario, whose TOML file is printed as a template of your own."),
 ) -> None:
@@ -22,7 +22,7 @@ def scenarios(
         ui.say(sd.scenarios.builtin_toml(name).rstrip())
 
 
-@ui.command
+@ui.command()
 def keys(
     section: str | None = Argument(
         None, help="top, motion, gyro or sensors, or a type of motion or sensor, such as coning or magnetometer."
@@ -42,33 +42,18 @@ def keys(
         ui.say("The keys of one section: strapdown keys SECTION, such as gyro or coning.")
 
 
-@ui.command
+@ui.command()
 def simulate(
-    scenario: str = Argument(help=ui.SCENARIO),
+    scenario: str = Argument(help=SCENARIO),
     out: Path | None = Option(None, help="HDF5 file. Default: .h5 with the name, or the TOML file, of the scenario."),
     seed: int | None = Option(None, help="Seed. Default: that of the scenario."),
 ) -> None:
     """Simulate a scenario: a record with its truth."""
-    from strapdown.recordings import recordfiles
-
     loaded = sd.scenarios.load_scenario(scenario)
-    used = loaded.seed if seed is None else seed
     target = out or Path(f"{Path(scenario).stem}.h5")
-    own = recordfiles.is_record
-    ui.check_files(target, suffixes=(".h5", ".hdf5"), sources=(scenario,), own=own, command="simulate")
-    with ui.progress_bar("simulating, writing", 2) as advance:
-        record = sd.scenarios.simulate(loaded, used)
-        advance(1)
-        recordfiles.write_record(target, record)
-        advance(1)
-    length = record.time[-1] - record.time[0]
-    ui.say(f"{loaded.name or target.stem}: {len(record.increments)} gyro samples over {length:g} s, seed {used}.")
-    for series in record.vectors:
-        ui.say(f"  {series.sensor}: {len(series.time)} measurements ({series.kind})")
-        sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
-        if series.covariance is None and np.any(sigma == 0.0):
-            ui.say(
-                f"warning: {series.sensor}: its sigma is zero, which a filter cannot use; add noise in the scenario, or give the filter "
-                "another sigma in [filter.sigma]"
-            )
+    ui.check_files(target, suffixes=(".h5", ".hdf5"), own="strapdown record")
+    with ui.progress_bar("simulating, writing"):
+        record = sd.scenarios.simulate(loaded, seed)
+        sd.write(record, target)
+    ui.show(record.listing())
     ui.written(target)

@@ -1,29 +1,62 @@
-"""Functions shared by all commands: the application, the two consoles, tables, shared options, checks of files."""
+"""Functions shared by all commands: the consoles, declaration of a command, tables, checks of files, and progress of long computations.
+
+Progress is on standard error: a bar on a terminal, otherwise a line every ten seconds.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
 import inspect
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, get_type_hints
 
+import rich.progress as bars
 import rich.table
 import typer
 from rich import box
+from rich.console import Console
 from rich.text import Text
 from typer import Option
 
-from strapdown.checks import InputError
-from strapdown.cli.progress import PlainConsole, progress_bar
-from strapdown.files import json_text, usable_folder, writable, write_json
+from strapdown.checks import Hint, InputError
+from strapdown.files import json_text, reading, usable_folder, writable, write_json
 
 if TYPE_CHECKING:
-    from strapdown.recordings import Recording
     from strapdown.results import Table
+
+_CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
+"""Control characters except tab and newline."""
+_OPTIONS = {"initial": "--attitude or --from-truth", "noise": "--gyro", "priors": "--prior"}
+_OPTIONS |= {"estimator": "--filter", "setup": "--filter"}
+"""Options whose names differ from those of the argument in Python."""
+
+
+def option(hint: Hint) -> str:
+    """Return the option for an argument of Python, with its value."""
+    name = hint.argument.replace("_", "-")
+    flag = _OPTIONS.get(hint.argument, f"--no-{name}" if hint.value is False else f"--{name}")
+    if hint.value is None or isinstance(hint.value, bool):
+        return flag
+    if hint.argument == "units":
+        return " ".join(f"--{name}-unit {unit}" for name, unit in hint.value.items())
+    parts = hint.value.items() if isinstance(hint.value, dict) else ()
+    return f"{flag} {','.join(f'{name}={value}' for name, value in parts) or hint.value}"
+
+
+class PlainConsole(Console):
+    """A console that names options in hints, and shows no control characters: names of files may hold sequences that change a terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text with options in its hints and a mark in place of each control character."""
+        return super().render_str(Hint.replaced(text, option).translate(_CONTROL), **options)
+
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -32,80 +65,93 @@ app = typer.Typer(
 )
 # Without markup, so that brackets in file names are printed; a statement is one line, which the terminal wraps.
 console = PlainConsole(markup=False, highlight=False, soft_wrap=True)
+errors = PlainConsole(stderr=True, markup=False, highlight=False)
 
-Format = Literal["png", "pdf", "svg"]
-"""Formats of figures."""
-FORMAT: Any = Option("png", "--format", help="Format of the figures.")
-TABLES: Any = Option(None, help="Folder to which the tables are also written, as CSV with all digits and as LaTeX.")
-FILTER: Any = Option(None, "--filter", help="TOML with a table named filter. Default: a matched one.")
-STATES: Any = Option(
-    None,
-    "--states/--no-states",
-    help="A state for each specified error, or none. Default: if the matched filter needs them.",
-)
-GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
+_EXTRA: dict[str, Any] = {
+    "tables": Option(None, help="Folder to which the tables are also written, as CSV with all digits and as LaTeX."),
+    "json": Option(None, "--json", help="File for all numbers; - for standard output."),
+}
+"""Options that :func:`command` adds and serves."""
+OUTPUTS = ("out", "to", "target", "aligned", "json", "tables")
+"""Parameters of commands that name files to write; paths in all others are read."""
 CANNOT_TELL = 3
 STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1}
 """Exit status of a verdict, otherwise :data:`CANNOT_TELL`; 2 is that of bad usage or input."""
-SCENARIO = "Name of a built-in scenario, or a TOML file."
+
+_running: dict[str, Any] = {"name": "", "paths": [], "tables": []}
+"""Of the command that runs: its name, the paths that it reads, and the tables that it has shown."""
 
 
-def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Register a command; a parameter whose type is a dataclass becomes one option per field, under one heading of --help."""
-    hints = get_type_hints(function)
-    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
-    parameters = []
+def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
+    """Register a command; a parameter whose type is a dataclass becomes one option per field, under one heading of --help.
+
+    A command returns its numbers, if it has any; a verdict among them becomes the exit status. ``extra``: ``"tables"`` adds the option that
+    writes the tables that were shown, ``"json"`` the one that writes these numbers.
+    """
+
+    def registered(function: Callable[..., Any]) -> Callable[..., None]:
+        hints: dict[str, Any] = get_type_hints(function)
+        groups = [name for name, hint in hints.items() if dataclasses.is_dataclass(hint)]
+
+        @functools.wraps(function)
+        def run(**values: Any) -> None:
+            inputs = (value for name, value in values.items() if name not in OUTPUTS)
+            paths = [path for value in inputs for path in (value if isinstance(value, list) else [value])]
+            _running.update(
+                name=function.__name__, paths=[path for path in paths if isinstance(path, (str, Path))], tables=[]
+            )
+            folder, target = (values.pop(name, None) for name in ("tables", "json"))
+            printed = target == Path("-")
+            if printed:  # all other output then goes to standard error
+                console.stderr = True
+            elif target is not None:
+                check_files(target, suffixes=(".json",), name="json")
+            if folder is not None:
+                usable_folder("--tables", folder)
+            for name in groups:
+                fields = [field.name for field in dataclasses.fields(hints[name])]
+                values[name] = hints[name](**{field: values.pop(field) for field in fields})
+            numbers = function(**values) or {}
+            if printed:
+                sys.stdout.write(json_text(numbers))
+            elif target is not None:
+                write_json(target, numbers)
+                written(target)
+            if folder is not None:
+                from strapdown.report.tables import write
+
+                written(*write([table for table in _running["tables"] if table.name], folder))
+            if "verdict" in numbers:
+                raise typer.Exit(STATUS.get(numbers["verdict"], CANNOT_TELL))
+
+        parameters = list(_parameters(function, hints))
+        parameters += [inspect.Parameter(name, KEYWORD, default=_EXTRA[name], annotation=Path | None) for name in extra]
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return app.command()(run)
+
+    return registered
+
+
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
+
+
+def _parameters(function: Callable[..., Any], hints: dict[str, Any]) -> Iterator[inspect.Parameter]:
+    """Yield the parameters of a command or of a group; those of a group have the first line of its docstring as heading in --help."""
     for name, parameter in inspect.signature(function).parameters.items():
-        if name in groups:
-            parameters += _options(groups[name])
+        if dataclasses.is_dataclass(hints[name]):
+            for field in _parameters(hints[name], get_type_hints(hints[name])):
+                option = copy.copy(field.default)
+                option.rich_help_panel = str(hints[name].__doc__).partition("\n")[0].rstrip(".")
+                yield field.replace(default=option)
         else:
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name]))
-
-    @functools.wraps(function)
-    def run(**values: Any) -> None:
-        grouped = {
-            name: group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
-            for name, group in groups.items()
-        }
-        function(**values, **grouped)
-
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return app.command()(run)
-
-
-def _options(group: Any) -> list[inspect.Parameter]:
-    """Return the fields of a group as parameters; the first line of its docstring is the heading in --help."""
-    hints = get_type_hints(group)
-    parameters = []
-    for field in dataclasses.fields(group):
-        option: Any = copy.copy(field.default)
-        option.rich_help_panel = group.__doc__.partition("\n")[0].rstrip(".")
-        kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(field.name, kind, default=option, annotation=hints[field.name]))
-    return parameters
-
-
-def options_given(group: Any) -> list[str]:
-    """Return the options of a group that were given, as on the command line."""
-    flags = []
-    for field in dataclasses.fields(group):
-        option: Any = field.default
-        if getattr(group, field.name) not in (option.default, []):
-            flag = option.param_decls[0] if option.param_decls else "--" + field.name.replace("_", "-")
-            flags.append(flag.partition("/")[0])
-    return flags
+            yield parameter.replace(kind=KEYWORD, annotation=hints[name])
 
 
 def say(*sentences: str) -> None:
     """Print sentences, each on its line; empty ones are omitted."""
     for sentence in filter(None, sentences):
         console.print(sentence)
-
-
-def counted(number: int, what: str) -> str:
-    """Return a number with a noun, in the plural unless it is one."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def show(*tables: Table, title: str | None = None, notes: bool = True) -> None:
@@ -125,70 +171,97 @@ def show(*tables: Table, title: str | None = None, notes: bool = True) -> None:
         finally:
             console.width = width
         say(*(table.notes if notes else ()))
+    _running["tables"].extend(tables)
 
 
 def check_files(
     *paths: Path,
-    tables: Path | None = None,
-    sources: Any = (),
+    name: str = "out",
     suffixes: tuple[str, ...] = (),
-    own: Callable[[Path], bool] | None = None,
-    command: str = "",
+    own: str | Callable[[Path], Any] = "",
+    reads: bool = True,
 ) -> None:
-    """Raise an error, before anything is computed, for output files that cannot be written; ``tables``: folder of ``--tables``.
+    """Raise an error, before anything is computed, for output files that cannot be written, or are among the files read.
 
-    ``own``: whether the first file was written by ``command``, which replaces no other, of which there may be no copy.
+    ``own``: kind of the first file, or its reader: a file that this command did not write is not replaced. ``reads``: False for a file that
+    the command may read and continue.
     """
-    writable("out", *paths, suffixes=suffixes, sources=sources)
-    if tables is not None:
-        usable_folder("--tables", tables)
-    if own is None:
+    writable(name, *paths, suffixes=suffixes, sources=_running["paths"] if reads else ())
+    if not own or not paths[0].exists():
         return
     try:
-        replaceable = not paths[0].exists() or own(paths[0])
+        replaceable = reading.kind(paths[0]) == own if isinstance(own, str) else own(paths[0])
     except InputError:
         replaceable = False
     if not replaceable:
         raise InputError(
-            f"{paths[0]} exists and was not written by `strapdown {command}`; move it, or choose another --out"
+            f"{paths[0]} exists and was not written by `strapdown {_running['name']}`; move it, or choose another --out"
         )
 
 
-def written(*paths: Any, tables: tuple[Path | None, Any] = (None, ())) -> None:
-    """Print which files were written; ``tables``: folder of ``--tables``, if one is given, and the tables to write to it."""
-    folder, listed = tables
-    if folder is not None:
-        from strapdown.report.tables import write
-
-        paths = (*paths, *write(listed, folder))
+def written(*paths: Any) -> None:
+    """Print which files were written."""
     if paths:
         console.print("Written: " + ", ".join(map(str, paths)))
 
 
-def warn_about_conventions(source: Recording, path: Path) -> None:
-    """Warn if axes, signs or units of a recording seem wrong."""
-    from strapdown.ahrs import check_conventions
+# ---------------------------------------------------------------------------------------------------------------- progress
 
-    with progress_bar("testing conventions"):
-        doubts = check_conventions.examine(source).warnings
-    say(*(f"warning: {words}. See `strapdown doctor {path}`, with the same options of the file." for words in doubts))
+LINE_INTERVAL = 10.0
+"""Time between two lines if the output is no terminal, s."""
 
-
-STANDARD_OUTPUT = Path("-")
+_quiet = False
 
 
-def json_target(json: Path | None, *sources: Path | None) -> None:
-    """Raise an error if a JSON file cannot be written; "-" is standard output, and all other output then goes to standard error."""
-    if json == STANDARD_OUTPUT:
-        console.stderr = True
-    elif json is not None:
-        writable("json", json, suffixes=(".json",), sources=sources)
+def be_quiet() -> None:
+    """Show no progress from now on."""
+    global _quiet  # noqa: PLW0603 (one process runs one command)
+    _quiet = True
 
 
-def put_json(json: Path | None, content: Any) -> None:
-    """Write JSON to the target, if one is given."""
-    if json == STANDARD_OUTPUT:
-        sys.stdout.write(json_text(content))
-    elif json is not None:
-        write_json(json, content)
-        written(json)
+def rate_text(speed: float) -> str:
+    """Return a rate with three digits, or as an integer if it has more."""
+    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
+
+
+class _Rate(bars.ProgressColumn):
+    """Runs per second, recent or, of a finished task, on average."""
+
+    def render(self, task: bars.Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{rate_text(speed)} runs/s")
+
+
+@contextlib.contextmanager
+def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[[int | str], None]]:
+    """Yield a function that advances the progress by a number of units, or describes it; without ``total`` only the time is shown."""
+    done, begin, ended = 0, time.monotonic(), Event()
+
+    def advance(step: int | str) -> None:
+        nonlocal done, what
+        what, done = (step, done) if isinstance(step, str) else (what, done + step)
+        if bar is not None:
+            bar.update(task, description=what, completed=done)
+
+    def watch() -> None:
+        while not ended.wait(LINE_INTERVAL):
+            share = "" if total is None else f" {done} of {total},"
+            errors.print(f"{what}:{share} {time.monotonic() - begin:.0f} s", soft_wrap=True)
+
+    bar = None
+    if errors.is_terminal and not _quiet:
+        rate = [_Rate()] if what == "runs" else []
+        known = (bars.MofNCompleteColumn(), *rate, bars.TimeRemainingColumn()) if total else ()
+        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
+        bar = bars.Progress(*columns, console=errors, transient=True)
+        task = bar.add_task(what, total=total)
+    watcher = Thread(target=watch, daemon=True)
+    with bar or contextlib.nullcontext():
+        if bar is None and not _quiet:
+            watcher.start()
+        try:
+            yield advance
+        finally:
+            ended.set()
+            if watcher.ident is not None:
+                watcher.join()

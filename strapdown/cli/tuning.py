@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import InputError, count, one_of
+from strapdown.checks import InputError, one_of
 from strapdown.cli import terminal as ui
-from strapdown.cli.reading import Layout
-from strapdown.files import write_json, write_text
-
-if TYPE_CHECKING:
-    from strapdown.estimation.setup import FilterSetup
-    from strapdown.gyro import GyroSpec
-
+from strapdown.cli.options import FILTER, FORMAT, Format, Layout
+from strapdown.files import write_json
 
 FIGURES = ("likelihood", "heldout")
 """Figures written beside the filter, by the ends of their names."""
@@ -33,7 +28,7 @@ class _Filter:
         "initial.bias, gate.probability; or only filter.scale. Default: the two of the gyro and the sigma of every sensor; for a recording "
         "without --truth only filter.scale is allowed.",
     )
-    filter_file: Path | None = ui.FILTER
+    filter_file: Path | None = FILTER
     states: bool = Option(
         False,
         "--states",
@@ -42,24 +37,19 @@ class _Filter:
     prior: str | None = Option(None, help="Weak prior of the gyro noise: TOML of `strapdown allan`, or a preset.")
 
     @property
-    def names(self) -> list[str] | None:
-        """Names of the parameters, if given."""
-        if not self.free:
-            return None
-        names = [name.strip() for name in ",".join(self.free).split(",") if name.strip()]
-        if not names:
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.tune`."""
+        names = [name.strip() for name in ",".join(self.free or ()).split(",") if name.strip()]
+        if self.free and not names:
             raise InputError(f"--free is {','.join(self.free)!r} and names no parameter; name some, or leave it out")
-        return names
-
-    @property
-    def spec(self) -> GyroSpec | None:
-        """The gyro of the prior, if given."""
-        if self.prior is None:
-            return None
-        if Path(self.prior).suffix == ".toml":
-            return sd.gyro.read_spec(self.prior)
-        presets = sd.gyro.datasheets.PRESETS
-        return presets[one_of("--prior", self.prior, presets)].spec
+        spec = None
+        if self.prior is not None and Path(self.prior).suffix == ".toml":
+            spec = sd.gyro.read_spec(self.prior)
+        elif self.prior is not None:
+            presets = sd.gyro.datasheets.PRESETS
+            spec = presets[one_of("--prior", self.prior, presets)].spec
+        setup = self.filter_file and sd.estimation.setup.read_setup(self.filter_file)
+        return {"setup": setup, "free": names or None, "states": self.states, "priors": spec}
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ class _Search:
     threads: int | None = Option(None, help="Number of threads. Default: one per core.")
 
 
-@ui.command
+@ui.command("tables")
 def tune(
     *,
     records: list[Path] = Argument(help="Records or recordings (BROAD HDF5, CSV), all of one unit."),
@@ -92,81 +82,41 @@ def tune(
     search: _Search,
     layout: Layout,
     out: Path = Option(Path("filter.toml"), "--out", "-o", help="TOML for --filter; beside it JSON and figures."),
-    form: ui.Format = ui.FORMAT,
-    tables: Path | None = ui.TABLES,
+    form: Format = FORMAT,
 ) -> None:
     """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
-    from strapdown.estimation.setup import read_setup, to_toml
     from strapdown.plots import tuning as drawing
     from strapdown.report import tunings
-    from strapdown.workflows.tuning import tuned
 
-    count("seed", search.seed, minimum=0)
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
             raise InputError(f"{path} is given twice; give each record once")
-    free, beside = start.names, out.with_suffix(".json")
-    places = {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
-    inputs, own = (*records, start.filter_file), lambda _: bool(tunings.read(beside))
-    ui.check_files(out, suffixes=(".toml",), sources=inputs, own=own, command="tune")
-    ui.check_files(beside, *places.values(), tables=tables, sources=inputs, own=own, command="tune")
-    filter_setup = None if start.filter_file is None else read_setup(start.filter_file)
-    sources = _sources(records, filter_setup, start, layout)
-    if filter_setup is not None and (filter_setup.gate or filter_setup.robust) and not (goal.truth or goal.gate):
-        ui.say(
-            "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
-            "and --truth tunes the filter with its gate and weights."
-        )
+    beside, places = out.with_suffix(".json"), {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
+    ui.check_files(out, suffixes=(".toml",), own=lambda _: tunings.read(beside))
+    ui.check_files(beside, *places.values(), own=tunings.read)
+    sources: dict[str, Any] = {}
+    for path in records:
+        simulated = sd.recordings.is_record(path)
+        source: Any = sd.read(path, **({} if simulated else layout.options))
+        if start.states and not simulated:
+            raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
+        ui.say("" if simulated else source.left_out_words)
+        sources[path.name if path.name not in sources else str(path)] = source
     with ui.progress_bar("searches") as advance:
-        result, objective, _ = tuned(
-            sources,
-            names=[path.name for path in records],
-            setup=filter_setup,
-            free=free,
-            states=start.states,
-            priors=start.spec,
-            **vars(goal),
-            **vars(search),
-            progress=advance,
-        )
-    listed = result.tables
-    ui.show(listed[0])
+        result = sd.tune(sources, **start.options, **vars(goal), **vars(search), progress=advance)
+    ui.show(*result.tables)
     ui.say(*result.words)
-    ui.show(*listed[1:])
-    write_text(out, to_toml(result.setup))
+    sd.write(result.setup, out)
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
-        for other in ("png", "pdf", "svg"):
-            place.with_suffix(f".{other}").unlink(missing_ok=True)
+        for other in (".png", ".pdf", ".svg"):
+            place.with_suffix(other).unlink(missing_ok=True)
     with ui.progress_bar("slices of the likelihood"):
-        slices = sd.tuning.slices(objective, result)
-    content = {"records": [path.name for path in records], **result.summary(), "slices": slices.summary()}
-    write_json(beside, content)
+        slices = sd.tuning.slices(result)
+    write_json(beside, {"records": list(sources), **result.summary(), "slices": slices.summary()})
     answer, reason, details = sd.tuning.fitting.verdict(result)
     ui.say(f"{answer}: {reason}.", *(f"  - {detail}" for detail in details if result.comparison is not None))
     figures = {places["likelihood"]: drawing.likelihood_slices(slices, result)}
     if result.comparison is not None:
         title = "Held-out part of the first record"
         figures[places["heldout"]] = drawing.before_and_after(result.comparison, title=title)
-    ui.written(out, beside, *sd.plots.save_as(figures, form), tables=(tables, listed))
-
-
-def _sources(paths: list[Path], filter_setup: FilterSetup | None, start: _Filter, layout: Layout) -> list[Any]:
-    """Return the records; say what the filter of the first does not model."""
-    from strapdown.recordings import recordfiles
-    from strapdown.workflows.filters import matched_filter
-
-    sources: list[Any] = []
-    for path in paths:
-        if recordfiles.is_record(path):
-            source: Any = recordfiles.read_record(path)
-            if filter_setup is None and not any(isinstance(other, type(source)) for other in sources):
-                ui.say(*matched_filter(source, states=start.states)[1])
-        else:
-            if start.states:
-                raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            source = sd.recordings.read(path, **layout.options(path))
-            ui.say(source.left_out_words)
-            sd.ahrs.need_accelerometer(source)
-            ui.warn_about_conventions(source, path)
-        sources.append(source)
-    return sources
+    ui.written(out, beside, *sd.plots.save_as(figures, form))

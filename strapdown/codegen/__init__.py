@@ -149,7 +149,7 @@ def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | V
 
     if isinstance(sensors, Scenario):
         return simulate(sensors).vectors
-    raise InputError(f"sensors is {sensors!r}; give a record, a scenario, or a sequence of sensors")
+    raise InputError(f"sensors is {type(sensors).__name__}; give a record, a scenario, or a sequence of sensors")
 
 
 def _origin(setup: FilterSetup | LiveAhrs, precision: str) -> str:

@@ -34,7 +34,7 @@ from strapdown.consistency.bounds import mean_p_value
 from strapdown.consistency.judgement import DETECTABLE, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
-from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records import Estimate, Innovations, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -74,9 +74,7 @@ class Checked:
     judgement : Judgement
         The verdict with its evidence.
     estimate : Estimate
-        The estimate as it was judged: in the truth's clock and frames, with the covariance of the body-side error.
-    truth : Truth or None
-        The truth at the estimate's times.
+        The estimate as it was judged: in the truth's clock and frames, with the covariance of the body-side error, and with its truth.
     alignment : Alignment or None
         Differences of clocks and frames that were estimated and removed.
     error_frame : str
@@ -93,13 +91,18 @@ class Checked:
 
     judgement: Judgement
     estimate: Estimate
-    truth: Truth | None = None
     alignment: Alignment | None = None
     error_frame: str = ""
     frame_probability: Mapping[str, float] = field(default_factory=dict)
     explanations: tuple[Explanation, ...] = ()
     remarks: tuple[str, ...] = ()
     accuracy: Accuracy | None = None
+
+    @property
+    def tables(self) -> list[Table]:
+        """The errors relative to the truth, and their possible causes, if there are any."""
+        tables = [] if self.accuracy is None else [self.accuracy.listing()]
+        return [*tables, self.listing()] if self.explanations else tables
 
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
@@ -204,11 +207,9 @@ def check_attitudes(
         align,
         how,
     )
-    if declared == error_frame:
-        return checked
-    return replace(
-        checked, remarks=(*checked.remarks, f"the file declares that its covariance is of the {declared} error")
-    )
+    declares = () if declared == error_frame else (f"the file declares that its covariance is of the {declared} error",)
+    estimate = replace(checked.estimate, origin=Origin(source=own.source), details={"truth": truth.source})
+    return replace(checked, estimate=estimate, remarks=(*checked.remarks, *declares))
 
 
 def _checked(
@@ -251,8 +252,7 @@ def _checked(
         explained = explanations(error, readings, frame, probabilities, truth, moved, confidence_level=level)
     return Checked(
         judgement=judgement,
-        estimate=estimate,
-        truth=truth,
+        estimate=replace(estimate, truth=truth),
         alignment=alignment,
         error_frame=frame,
         frame_probability=probabilities if error_frame == "find" else {},

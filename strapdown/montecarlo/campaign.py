@@ -10,11 +10,14 @@ the fold without it, ``resume/whole``. So an extended campaign is bitwise identi
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +30,7 @@ from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
+from strapdown.montecarlo import verdicts
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
@@ -131,13 +135,19 @@ class Campaign(Listed):
         return self.statistics.listing()
 
     def summary(self) -> dict[str, Any]:
-        """Return plan and provenance as plain values for JSON.
+        """Return plan, provenance, verdict and statistics as plain values for JSON.
 
         Returns
         -------
         dict
-            Plan with its digest, engine, chunk size, version and time; :func:`strapdown.montecarlo.summary` has the statistics.
+            Plan with its digest, engine, chunk size, version and time; if runs are finished, also ``judgement`` and what
+            :func:`strapdown.montecarlo.summary` returns.
         """
+        statistics = self.statistics
+        own: dict[str, Any] = {}
+        if statistics is not None:
+            judgement = statistics.judge().summary()
+            own = {"judgement": judgement, **verdicts.summary(statistics, bound=verdicts.bound_of(self.plan))}
         return {
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
@@ -146,7 +156,15 @@ class Campaign(Listed):
             "chunk": self.chunk,
             "version": self.version,
             "seconds": self.seconds,
+            **own,
         }
+
+    @property
+    def extent(self) -> str:
+        """Numbers of runs, seed and machine, in words."""
+        done = 0 if self.statistics is None else self.statistics.runs
+        number = f"{done} run{'' if done == 1 else 's'}" if self.finished else f"{done} of {self.runs} runs"
+        return f"{number} of {self.plan.scenario.duration:g} s, seed {self.plan.seed}, machine {self.machine}"
 
     @property
     def finished(self) -> bool:
@@ -222,7 +240,7 @@ def run(
     plan : Plan
         Scenario, filter and seed.
     path : path
-        HDF5 file. Finished chunks are written at intervals, so that writing takes below a tenth of the time, and on Ctrl-C.
+        HDF5 file. Finished chunks are written at intervals, so that writing takes below a tenth of the time, and on Ctrl-C or SIGTERM.
     runs : int
         Total number of runs; if more than the file holds, it is extended.
     resume : bool, default False
@@ -254,7 +272,7 @@ def run(
             f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
     engine = choose(plan, machine)
-    with locked(target):
+    with locked(target), _asked_to_stop() as stop_if_asked:
         held = _stored(target) if resume and target.exists() else None
         if held is None:
             size = MACHINES[engine.machine].CHUNK if chunk is None else count("chunk", chunk)
@@ -280,7 +298,39 @@ def run(
             return now
 
         work = Work(plans=(plan,), machine=engine.machine)
-        return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
+        advance = progress or (lambda number: None)
+
+        def advanced(number: int) -> None:
+            advance(number)
+            stop_if_asked()
+
+        return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, advanced)
+
+
+@contextlib.contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], None]]:
+    """Treat SIGTERM, which batch systems send before they kill a process, as Ctrl-C, so that completed runs are written.
+
+    Yields a function that raises again after a signal: Python drops an exception that is raised while a weak reference is cleared. Only the
+    main thread receives signals; one that whoever started the process had ignored stays ignored.
+    """
+    asked: list[int] = []
+
+    def stop(*signals: Any) -> None:
+        asked.extend(signals[:1])
+        if asked:
+            raise KeyboardInterrupt
+
+    main = threading.current_thread() is threading.main_thread()
+    heeded = [
+        number for number in (signal.SIGTERM, signal.SIGINT) if main and signal.getsignal(number) != signal.SIG_IGN
+    ]
+    before = {number: signal.signal(number, stop) for number in heeded}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _compute(
@@ -289,11 +339,11 @@ def _compute(
     runs: int,
     workers: Workers,
     write: Callable[[], Campaign],
-    progress: Callable[[int], None] | None,
+    progress: Callable[[int], None],
 ) -> Campaign:
     """Compute the missing chunks; write at once, at intervals, and at the end or an exception; return the last written state."""
     missing = state.missing(runs)
-    if progress is not None and (done := runs - sum(n for _, n in missing)):
+    if done := runs - sum(n for _, n in missing):
         progress(done)
     written = write()  # fails before anything is computed if the file cannot be written
     due, unwritten = 0.0, False
@@ -301,8 +351,7 @@ def _compute(
         for place, (part,) in workers(work, missing):
             state.take(missing[place][0], part)
             unwritten = True
-            if progress is not None:
-                progress(missing[place][1])
+            progress(missing[place][1])
             if (now := time.perf_counter()) >= due:
                 written, unwritten = write(), False
                 due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -281,6 +282,15 @@ def _drift(value: float | None) -> str:
     return f"{value:.4g}" if abs(value) > ROUNDING else "rounding"
 
 
+def words(summary: Mapping[str, Any]) -> str:
+    """Return the cone, the gyro and the runs of a study's :meth:`ConingStudy.summary` in words."""
+    p = summary["scenario"]
+    return (
+        f"Coning of {p['angle_deg']:g}° at {p['frequency_hz']:g} Hz, gyro sampled at {p['rate_hz']:g} Hz ({p['samples_per_cycle']:.3g} "
+        f"samples per cycle); {p['runs']} run{'' if p['runs'] == 1 else 's'} of {p['duration_s']:g} s, seed {p['seed']}"
+    )
+
+
 def tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return the tables of a study's :meth:`ConingStudy.summary`: one's own algorithms, if any, the drifts, and the filter with each.
 
@@ -311,6 +321,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     )
     outcomes = [{**row, "bias_mean_z_deg_per_hour": row["bias_mean_deg_per_hour"][2]} for row in summary["filter"]]
     return [
+        *_own_table(summary),
         _table("Drift of the integration, °/h about the cone's axis", drifts, summary["integration"], name="drift"),
         _table(
             "The same filter with each algorithm: RMS error and σ of the filter",
@@ -322,8 +333,8 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     ]
 
 
-def own_table(own: Sequence[coning.Algorithm]) -> Table:
-    """Return the orders and drift constants of user-defined algorithms as a table, with the best for their numbers of increments."""
+def _own_table(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the orders and drift constants of user-defined algorithms, with the best for their numbers of increments; none without any."""
     columns = (
         Column("algorithm", "name"),
         Column("samples", "samples"),
@@ -333,15 +344,13 @@ def own_table(own: Sequence[coning.Algorithm]) -> Table:
         Column("optimum n", "best_drift_order"),
         Column("C for the same increments", "best_drift_constant"),
     )
-    rows = []
-    for algorithm in own:
-        constant = algorithm.drift_constant
-        exact = f" = {constant}" if constant.denominator < SHOWN_DENOMINATOR else ""
-        rows.append(
-            {**own_summary(algorithm), "samples": algorithm.samples, "drift_constant": f"{float(constant):.4g}{exact}"}
-        )
+    samples, rows = {drift["algorithm"]: drift["samples"] for drift in summary["integration"]}, []
+    for own in summary.get("own", ()):
+        exact = f" = {own['drift_constant']}" if Fraction(own["drift_constant"]).denominator < SHOWN_DENOMINATOR else ""
+        constant = f"{own['drift_constant_value']:.4g}{exact}"
+        rows.append({**own, "samples": samples[own["name"]], "drift_constant": constant})
     title = "Your own algorithms: drift under small coning is −C β² ω (ωh)^n, derived from the coefficients"
-    return _table(title, columns, rows, name="own")
+    return [_table(title, columns, rows, name="own")] if rows else []
 
 
 SHOWN_DENOMINATOR = 10**7

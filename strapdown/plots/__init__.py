@@ -27,6 +27,7 @@ from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency, coning_errors, draw_coning_study, drift_by_algorithm
 from strapdown.plots.decimation import decimated
 from strapdown.plots.estimates import (
+    draw_estimate,
     error_overview,
     errors_in_envelope,
     estimate_overview,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -242,3 +244,18 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     style.legend_below(figure, [axes[0, 0]])
     figure.suptitle(f"{title}{': e' if title else 'E'}rrors against the truth")
     return figure
+
+
+def draw_estimate(
+    estimate: Estimate, folder: str | os.PathLike[str], form: str = "png", *, title: str = ""
+) -> list[Path]:
+    """Write the figures of an estimate, its error states, and its errors relative to its truth or reference; return the files."""
+    truth, target = estimate.truth, Path(folder)
+    figures = {target / "estimate": estimate_overview(estimate, title=title, fixed_frame=estimate.fixed_frame)}
+    if estimate.error_states:
+        figures[target / "states"] = states_over_time(estimate, title=title)
+    if truth is not None and truth.has_bias:
+        figures[target / "errors"] = error_overview(estimate, truth, title=title)
+    elif truth is not None:
+        figures[target / "errors"] = recording_errors(estimate, truth.attitude, truth.movement)
+    return style.save_as(figures, form)

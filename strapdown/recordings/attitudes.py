@@ -90,6 +90,11 @@ class Attitudes:
         stamps = _whole_ns(array("time", time, ("m",)))
         return cls(source=source, stamps_ns=stamps, attitude=attitude, **fields)  # type: ignore[arg-type]
 
+    @property
+    def extent(self) -> str:
+        """Number of attitudes and their time span, in words."""
+        return f"{len(self.stamps_ns)} attitudes over {(self.stamps_ns[-1] - self.stamps_ns[0]) / 1e9:.6g} s"
+
     def seconds(self, origin_ns: int) -> Array:
         """Return the stamps relative to an origin.
 

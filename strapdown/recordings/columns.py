@@ -115,20 +115,6 @@ def unit_of(group: str, text: str) -> str:
     return spelled or ("" if group == "magnetometer" else small.get(squeezed, ""))
 
 
-def parse_mapping(text: str) -> dict[str, str]:
-    """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, that of the command line."""
-    mapping: dict[str, str] = {}
-    for part in text.split(","):
-        role, equals, name = part.partition("=")
-        role = role.strip()
-        if not equals or not name.strip():
-            raise InputError(f"columns: {part.strip()!r} is not ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
-        if role in mapping:
-            raise InputError(f"columns: {role} is given twice; keep one")
-        mapping[role] = name.strip()
-    return mapping
-
-
 def recording(
     source: str,
     header: Sequence[str],

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import InputError
+from strapdown.checks import InputError, one_of
 from strapdown.files import reading
 from strapdown.recordings import bag_files, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import Estimate, ImuRecord, outputs
 from strapdown.records.recording import Recording, matched, with_gyro
 
 HEAD = 4096
@@ -224,7 +224,7 @@ def write(
     written if the format supports them (a ROS bag needs it); ``options`` are those of the format's writer.
     """
     if isinstance(content, ImuRecord):
-        content = from_record(content, "record")
+        content = from_record(content)
     if isinstance(content, Estimate):
         file_format = estimate_format(path, options, recording=recording is not None)
         _function(file_format.write_estimate)(content, Path(path), recording=recording, **options)
@@ -232,17 +232,23 @@ def write(
         _function(_by_ending(path, "write").write)(content, Path(path), **options)
 
 
-def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *, recording: bool = True) -> Format:
+def estimate_format(
+    path: str | os.PathLike[str], options: Mapping[str, Any] | None = None, *, recording: bool = True
+) -> Format:
     """Return the format of an estimate's file, so that a file that cannot be written is rejected before the computation.
 
     ``options`` are the writer's options to be used; ``recording`` is whether there is a recording, whose samples some formats need.
     """
     file_format = _by_ending(path, "write_estimate")
-    for name in options:
+    for name, value in (options or {}).items():
         if name not in file_format.estimate_options:
             raise InputError(
                 f"{path} ({file_format.name}) has no option {name}; leave it out, or choose another extension"
             )
+        if name == "frame":
+            one_of("frame", value, outputs.FRAMES)
+        elif name == "sequence":
+            outputs.euler([[1.0, 0.0, 0.0, 0.0]], value)
     if file_format.with_samples and not recording:
         raise InputError(
             f"{path} ({file_format.name}) needs the samples too; give the recording that the estimate was made from, or choose another "
@@ -289,16 +295,18 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
                 own["magnetic_unit"] = "T"
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
-    words = (
-        f"Left out: {', '.join(left_out)}. Recordings store only whole vectors of an accelerometer and a magnetometer."
-    )
+    remarks = ["Simulated record: the rate at each time stamp is the mean over the sample interval before it."]
+    if left_out:
+        remarks.append(
+            f"Left out: {', '.join(left_out)}. Recordings store only whole vectors of an accelerometer and a magnetometer."
+        )
     return with_gyro(
         source=source,
         time=record.time[1:],
         rate=record.rates,
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
         temperature=None if record.temperature is None else record.temperature[1:],
-        remarks=(words,) if left_out else (),
+        remarks=tuple(remarks),
         **own,
     )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, array, one_of, positive
+from strapdown.checks import Array, Hint, InputError, array, one_of, positive
 from strapdown.files import reading
 from strapdown.recordings import formats, recordfiles
 from strapdown.recordings.body_axes import SENSORS as COLUMN_OF
@@ -62,17 +62,19 @@ def read_samples(
     """
     file, unit_of_sensor = Path(path), dict(units or {})
     one_of("sensor", sensor, SENSORS)
-    if file.suffix.lower() == ".npy":
+    npy = file.suffix.lower() == ".npy"
+    simulated = not npy and recordfiles.is_record(file)
+    for name, value in (("units", units), ("columns", columns), ("topic", topic)):
+        if value and (simulated or (npy and name != "units")):
+            what = "a record, which declares its own layout" if simulated else "one array"
+            raise InputError(f"{file.name} is {what}; leave {Hint(name, value)} out")
+    if npy:
         reading.existing_file(file)
         with reading.from_file(file):
             samples = _read_array(file, sensor, rate, unit_of_sensor)
     elif rate is not None:
         raise InputError(f"{file.name} states its own rate; drop the option rate")
-    elif recordfiles.is_record(file):
-        if unit_of_sensor:
-            raise InputError(
-                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(unit_of_sensor)}"
-            )
+    elif simulated:
         samples = samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
     else:
         recording = formats.read(file, units=unit_of_sensor, gyro_alone=sensor == "gyro", columns=columns, topic=topic)

@@ -259,6 +259,16 @@ class Estimate(ByValue, Listed):
     remarks: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def extent(self) -> str:
+        """Numbers of epochs and measurements, and what its errors can be known from, in words."""
+        measurements = sum(len(innovations.time) for innovations in self.innovations.values())
+        truth = "without truth"
+        if self.truth is not None:
+            truth = "with its truth" if self.truth.has_bias else "with a reference attitude"
+        span = self.time[-1] - self.time[0]
+        return f"{len(self.time)} epochs over {span:.6g} s, {measurements} measurements, {truth}"
+
     def listing(self) -> Table:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
         rows: list[tuple[Any, ...]] = []

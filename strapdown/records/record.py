@@ -179,6 +179,13 @@ class ImuRecord(Listed):
         if self.origin is not None and self.origin.scenario is not None:
             name = self.origin.scenario.name or "a scenario"
             notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
+        for series in self.vectors:
+            sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
+            if series.covariance is None and np.any(sigma == 0.0):
+                notes.append(
+                    f"warning: {series.sensor}: its sigma is zero, which a filter cannot use; add noise in the scenario, or give the "
+                    "filter another sigma in [filter.sigma]"
+                )
         return Table(f"Record over {span:.6g} s", ("sensor", "measures", "samples", "Hz"), rows, notes, left=2)
 
     @functools.cached_property

@@ -145,7 +145,8 @@ class Recording(Listed):
                 ends = (float(np.median(size)), float(size.max())) if len(size) else (None, None)
                 rows.append((name, unit, len(size), *ends))
         title = f"{self.source}: {len(self.time)} samples over {span:.6g} s, {(len(self.time) - 1) / span:.4g} Hz"
-        return Table(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
+        notes = [sentence for sentence in (*self.remarks, self.left_out_words) if sentence]
+        return Table(title, ("sensor", "unit", "samples", "median size", "largest"), rows, notes, left=2)
 
     @functools.cached_property
     def interval(self) -> float:

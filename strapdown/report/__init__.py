@@ -19,7 +19,7 @@ from typing import Any
 
 from strapdown import records
 from strapdown.checks import InputError
-from strapdown.files import write_json, write_text
+from strapdown.files import writable, write_json, write_text
 from strapdown.files.reading import existing_file, from_file, json_file
 from strapdown.report import campaigns, comparisons, conings, estimates, tunings
 
@@ -70,6 +70,8 @@ def write(
     target = source.with_suffix(".html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"out is {target}; give a file with the suffix .html")
+    beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
+    writable("out", target, beside, sources=(source, other))
     kind = _kind(source)
     if kind not in _WRITERS:
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
@@ -82,7 +84,6 @@ def write(
             if {kind, _kind(Path(other))} != {"strapdown estimate"}:
                 raise InputError(f"{source} and {other}: only two estimates can be compared; give their HDF5 files")
             content, statistics = comparisons.report(source, Path(other))
-    beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
     write_text(target, content, errors="backslashreplace")  # a name may not be UTF-8
     write_json(beside, statistics)
     return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))

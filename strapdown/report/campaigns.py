@@ -33,11 +33,9 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
     failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
-    unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
     content = page.page(
         f"Monte Carlo: {name}",
-        f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
-        f"{held.machine}{unfinished}; strapdown {held.version}",
+        f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.version}",
         page.judged(judgement),
         page.section("Key numbers", *parts, *failed),
         page.section("Evidence", page.table(judgement.listing())),

@@ -26,7 +26,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
 
 def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     scenario, drifts, filters = study["scenario"], study["integration"], study["filter"]
-    drift_table, filter_table = coning_study.tables(study)
+    *own_tables, drift_table, filter_table = coning_study.tables(study)
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
     passing = [row["integration"] for row in filters if row["consistent"]]
@@ -34,9 +34,9 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter: {', '.join(passing) or 'none'}"
     content = page.page(
         "Coning study",
-        f"cone of {scenario['angle_deg']:g}° at {scenario['frequency_hz']:g} Hz, gyro at {scenario['rate_hz']:g} Hz; "
-        f"{scenario['runs']} runs of {scenario['duration_s']:g} s, seed {scenario['seed']}",
+        coning_study.words(study),
         page.verdict(answer, reason),
+        *map(page.listed, own_tables),
         *_charts([row["algorithm"] for row in drifts], sizes, _DRIFT),
         page.listed(drift_table),
         *_charts([row["integration"] for row in filters], filters, _FILTER),

@@ -33,15 +33,10 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         )
     judgement = workflows.check(estimate)
     table = None if truth is None else workflows.accuracy(estimate)
-    span = estimate.time[-1] - estimate.time[0]
-    used = sum(len(innovations.time) for innovations in estimate.innovations.values())
     source = "" if estimate.origin is None else estimate.origin.source
     content = page.page(
         f"Estimate of {source}" if source else f"Estimate {path.name}",
-        f"{path.name}: {len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
-        f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
-        f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
-        f"strapdown {attributes.get('version', '')}",
+        f"{path.name}: {estimate.extent}; strapdown {attributes.get('version', '')}",
         page.judged(judgement),
         page.listed(estimate.listing()),
         *([] if table is None else [page.listed(table.listing())]),

@@ -209,6 +209,8 @@ class Tuning(Listed):
         is not that of any such filter, and the maximum-likelihood filter need not be the best one.
     agreeing : int
         Number of searches that ended within 0.001 of the best log likelihood.
+    objective : Objective
+        Function that was minimised, for :func:`slices` of it.
     composite : bool, default False
         Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich).
     measure : str, default "likelihood"
@@ -219,6 +221,8 @@ class Tuning(Listed):
         The filter before and after on held-out data.
     unmodelled : tuple of Unmodelled
         Tests of records for errors that the tuned filter does not model.
+    remarks : tuple of str
+        What the filter that was tuned has no state for, and what of it was not applied.
     """
 
     parameters: tuple[Estimated, ...]
@@ -231,11 +235,13 @@ class Tuning(Listed):
     optima: Array
     misfit: bool
     agreeing: int
+    objective: Objective
     composite: bool = False
     measure: str = "likelihood"
     gate: TunedGate | None = None
     comparison: Comparison | None = None
     unmodelled: tuple[Unmodelled, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.
@@ -275,9 +281,10 @@ class Tuning(Listed):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Sentences on what the parameters do not say: the gate, errors that the filter does not model."""
+        """Sentences on what the parameters do not say: the remarks, the gate, errors that the filter does not model."""
         worst = max(self.unmodelled, key=lambda check: check.severity, default=None)
-        return (*(() if self.gate is None else (self.gate.words,)), *(() if worst is None else worst.words))
+        gate = () if self.gate is None else (self.gate.words,)
+        return (*self.remarks, *gate, *(() if worst is None else worst.words))
 
     @property
     def tables(self) -> list[Table]:
@@ -449,6 +456,7 @@ def fit(
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
+        objective=objective,
     )
 
 
@@ -570,8 +578,8 @@ SLICE_POINTS = 25
 """Number of points of a slice, odd, so that the tuned one is the middle."""
 
 
-def slices(objective: Objective, tuning: Tuning) -> Slices:
-    """Return slices of the objective through the tuned point, somewhat wider than each interval, without priors.
+def slices(tuning: Tuning) -> Slices:
+    """Return slices of the objective of a tuning through the tuned point, somewhat wider than each interval, without priors.
 
     The points are densest about the tuned one: a slice may be much narrower than the interval, for which the other parameters vary too.
     """
@@ -589,10 +597,10 @@ def slices(objective: Objective, tuning: Tuning) -> Slices:
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (SLICE_POINTS, 1))
         points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
-        value = objective.minus_log(points)
+        value = tuning.objective.minus_log(points)
         values.append(np.exp(points[:, j]))
         fallen.append(2.0 * (value - value.min()))
-    return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
+    return Slices(names=tuning.objective.names, values=np.array(values), fallen=np.array(fallen))
 
 
 def covariances(information: Array, parts: Array) -> tuple[Array, Array]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
@@ -12,23 +11,13 @@ from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Tuning, fit
 from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
-from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
+from strapdown.tuning.outliers import contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
 from strapdown.tuning.residual_checks import examined, with_misfit_flag
 from strapdown.tuning.validation import Comparison, compare
 
 GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
-
-
-class Tuned(NamedTuple):
-    """The outcome of :func:`tune`."""
-
-    tuning: Tuning
-    objective: Objective
-    """Function that was minimised, for :func:`fit` again or slices of it."""
-    gate: TunedGate | None
-    """The gate, if outliers were modelled."""
 
 
 def objective_for(
@@ -79,7 +68,7 @@ def tune(
     held: Sequence[Case] = (),
     truth: bool = False,
     spacing: float = 0.0,
-) -> Tuned:
+) -> Tuning:
     """Tune a filter: the objective, the search, and with ``gate`` the filter's gate.
 
     Parameters
@@ -101,8 +90,8 @@ def tune(
 
     Returns
     -------
-    Tuned
-        The tuning, whose ``setup`` is the tuned filter, the objective, and the gate.
+    Tuning
+        ``setup`` is the tuned filter; the gate and the comparison on held-out data are in it.
 
     Raises
     ------
@@ -126,7 +115,7 @@ def tune(
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=gated.gate))
     result = dataclasses.replace(result, gate=gated, comparison=_compared(held, setup, result, objective, threads))
     result = dataclasses.replace(result, measure="likelihood" + " of the errors" * truth)
-    return Tuned(_examined(cases, setup, result), objective, gated)
+    return _examined(cases, setup, result)
 
 
 def _compared(

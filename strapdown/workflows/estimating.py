@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -112,7 +111,7 @@ def estimate(
 
     Warns
     -----
-    UserWarning
+    strapdown.ahrs.ConventionWarning
         If units, axes or signs of a recording seem wrong.
 
     Examples
@@ -123,7 +122,7 @@ def estimate(
     """
     options = locals()
     if isinstance(source, Recording):
-        warn_about_conventions(source)
+        ahrs.check_conventions.warn(source)
     return run(**options).estimate
 
 
@@ -173,7 +172,7 @@ def smooth(
     """
     options = locals()
     if isinstance(source, Recording):
-        warn_about_conventions(source)
+        ahrs.check_conventions.warn(source)
     return run(**options, smooth=True).estimate
 
 
@@ -312,9 +311,3 @@ def _run_recording(
         },
     )
     return Run(estimate, result.record, parameters.setup, result.initial, result.calibration)
-
-
-def warn_about_conventions(source: Recording) -> None:
-    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
-    for words in ahrs.check_conventions.examine(source).warnings:
-        warnings.warn(f"{source.source}: {words}", stacklevel=3)

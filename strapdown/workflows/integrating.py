@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import coning, quaternion, recordings
+from strapdown.ahrs.remarks import gap_words
 from strapdown.checks import Array, InputError, instance
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
+from strapdown.results import ByValue
 from strapdown.workflows.estimating import SOURCE
 
 
-class AttitudeHistory(NamedTuple):
-    """Attitude integrated from the gyro only."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AttitudeHistory(ByValue):
+    """Attitude integrated from the gyro only.
+
+    Parameters
+    ----------
+    time : ndarray (k + 1,)
+        Edges of the algorithm's steps, s.
+    attitude : ndarray (k + 1, 4)
+        q_fb.
+    source : str, default ""
+        Recording that was integrated.
+    algorithm : str, default ""
+        Name of the algorithm.
+    remarks : tuple of str, default empty
+        Its length, samples not used, the error relative to the attitude of the source, gaps.
+    """
 
     time: Array
-    """Edges of the algorithm's steps (k + 1,), s."""
     attitude: Array
-    """q_fb (k + 1, 4)."""
+    source: str = ""
+    algorithm: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 def integrate(
@@ -44,6 +62,7 @@ def integrate(
     -------
     AttitudeHistory
         ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; remaining samples are dropped.
+        ``remarks`` have the error relative to a true attitude.
 
     Examples
     --------
@@ -69,4 +88,19 @@ def integrate(
     elif known is not None and np.isfinite(known[0]).all():
         start = known[0]
     attitude = coning.integrate(increments, rule, start, edges=time)
-    return AttitudeHistory(time[: len(attitude) * rule.samples : rule.samples], attitude)
+    steps = time[: len(attitude) * rule.samples : rule.samples]
+    remarks = [f"{len(increments)} samples over {steps[-1] - steps[0]:.6g} s with {rule.name}."]
+    if left := len(increments) % rule.samples:
+        remarks.append(f"Samples not used at the end, an incomplete step of {rule.samples}: {left}.")
+    true = np.empty((0, 4)) if known is None else known[:: rule.samples][: len(attitude)]
+    rows = np.isfinite(true).all(axis=1)
+    if rows.any():
+        error = np.degrees(quaternion.angle_between(quaternion.normalize(true[rows]), attitude[: len(true)][rows]))
+        remarks.append(f"Error relative to the true attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
+    if isinstance(source, Recording):
+        gaps = gap_words(recordings.gaps(source.time))
+        remarks += [f"{gaps}: the rotation during a gap is interpolated."] if gaps else []
+        remarks += [*source.remarks, source.left_out_words]
+    said = tuple(filter(None, remarks))
+    name = source.source if isinstance(source, Recording) else ""
+    return AttitudeHistory(time=steps, attitude=attitude, source=name, algorithm=rule.name, remarks=said)

@@ -69,7 +69,7 @@ def check(
     if statistics is None:
         raise InputError("the Monte Carlo has no finished run yet; resume it")
     if not hasattr(statistics, "log_nees_sum"):
-        raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
+        raise InputError(f"result is {type(result).__name__}; give an Estimate, or the result of monte_carlo")
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
     judgement: Judgement = statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)

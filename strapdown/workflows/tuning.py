@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
+from strapdown import ahrs
 from strapdown.checks import Hint, InputError, count, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
-from strapdown.workflows.estimating import SOURCE, warn_about_conventions
-from strapdown.workflows.filters import need_angles
+from strapdown.workflows.estimating import SOURCE
+from strapdown.workflows.filters import matched_filter, need_angles
 
 if TYPE_CHECKING:
     from strapdown.tuning import Prior, Tuning
-    from strapdown.tuning.procedure import Tuned
 
 
 def tune(
-    sources: ImuRecord | Recording | Sequence[ImuRecord | Recording],
+    sources: ImuRecord | Recording | Sequence[ImuRecord | Recording] | Mapping[str, ImuRecord | Recording],
     *,
     setup: FilterSetup | None = None,
     free: Sequence[str] | None = None,
@@ -35,13 +35,14 @@ def tune(
     starts: int = 4,
     seed: int = 0,
     threads: int | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Tuning:
     """Tune noise parameters of a filter by maximum likelihood of its innovations, with confidence intervals.
 
     Parameters
     ----------
-    sources : ImuRecord, Recording, or sequence of them
-        Records of one unit.
+    sources : ImuRecord, Recording, sequence or mapping of them
+        Records of one unit; in a mapping with their names in messages.
     setup : FilterSetup, optional
         Initial filter. Default: matched to the first record, or that of recordings.
     free : sequence of str, optional
@@ -65,6 +66,8 @@ def tune(
         Seed of the random initial values.
     threads : int, optional
         Number of threads. Default: one per core.
+    progress : callable, optional
+        Called after each evaluation with the progress, such as ``"searches: 1 of 4, 23 evaluations"``.
 
     Returns
     -------
@@ -77,43 +80,28 @@ def tune(
     >>> tuned = sd.tune(record, free=["gyro.arw", "star 1.sigma"])  # doctest: +SKIP
     >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
     """
-    options = locals()
-    listed = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
-    result = tuned(**{**options, "sources": listed})
-    for source in listed:
-        if isinstance(source, Recording):
-            warn_about_conventions(source)
-    return result.tuning
-
-
-def tuned(
-    sources: Sequence[ImuRecord | Recording],
-    *,
-    names: Sequence[str] = (),
-    setup: FilterSetup | None = None,
-    free: Sequence[str] | None = None,
-    states: bool | None = None,
-    priors: Mapping[str, Prior] | GyroSpec | None = None,
-    holdout: float | None = None,
-    threads: int | None = None,
-    **options: Any,
-) -> Tuned:
-    """Return the tuning of :func:`tune` with its objective; ``names``: those of the sources, in messages."""
     from strapdown import tuning
 
+    count("seed", seed, minimum=0)
+    if not isinstance(sources, Mapping):
+        listed = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
+        sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
     if not sources:
         raise InputError("sources is empty; give at least one record or recording")
-    labels = list(names) or [f"record {k}" if len(sources) > 1 else "" for k in range(len(sources))]
-    own, cases = setup is not None, []
-    for source, label in zip(sources, labels, strict=True):
+    for source in sources.values():
         instance("sources", source, (ImuRecord, Recording), SOURCE)
+        if isinstance(source, Recording):
+            ahrs.need_accelerometer(source)
+            ahrs.check_conventions.warn(source)
+    own, remarks, cases = setup is not None, list[str](), []
+    for label, source in sources.items():
         if isinstance(source, ImuRecord):
             if setup is None:
                 if source.origin is None or source.origin.gyro is None:
                     raise InputError(
                         f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
                     )
-                setup = setups.FilterSetup.for_record(source, states=states)
+                setup, remarks = matched_filter(source, states=states)
             elif own and states:
                 if setup.states is not None:
                     raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
@@ -125,25 +113,34 @@ def tuned(
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(source))
     assert setup is not None
-    if not (options.get("truth") or all(isinstance(source, ImuRecord) for source in sources)):
-        free, options["spacing"] = tuning.by_innovations(
-            free, options.get("spacing", 0.0), gate=options.get("gate"), priors=priors
+    if own and (setup.gate or setup.robust) and not (truth or gate):
+        remarks.append(
+            "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. "
+            f"{Hint('gate', True)} models outliers, and {Hint('truth', True)} tunes the filter with its gate and weights."
         )
+    if not (truth or all(isinstance(source, ImuRecord) for source in sources.values())):
+        free, spacing = tuning.by_innovations(free, spacing, gate=gate, priors=priors)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout)
     wanted = [name for name in free or () if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
-        specified = (
-            (label, source.origin)
-            for label, source in zip(labels, sources, strict=True)
-            if isinstance(source, ImuRecord)
-        )
-        tuning.one_gyro(
-            {label: origin.gyro for label, origin in specified if origin is not None and origin.gyro is not None}
-        )
+        origins = {label: source.origin for label, source in sources.items() if isinstance(source, ImuRecord)}
+        tuning.one_gyro({label: origin.gyro for label, origin in origins.items() if origin and origin.gyro})
     if isinstance(priors, GyroSpec):
         by_gyro = tuning.priors_from_gyro(priors, train[0].record)
         priors = {name: prior for name, prior in by_gyro.items() if name in wanted}
-    gate = options.pop("gate", False) or any(name in tuning.GATED for name in free or ())
-    workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
-    return tuning.tune(train, setup, wanted, held=held, priors=priors, gate=gate, threads=workers, **options)
+    result = tuning.tune(
+        train,
+        setup,
+        [*wanted, *(name for name in free or () if name in tuning.GATED)],
+        held=held,
+        priors=priors,
+        truth=truth,
+        gate=gate,
+        spacing=spacing,
+        starts=starts,
+        seed=seed,
+        threads=count("threads", threads if threads is not None else os.cpu_count() or 1),
+        progress=progress,
+    )
+    return dataclasses.replace(result, remarks=tuple(remarks))
