@@ -6,6 +6,10 @@ As in :mod:`strapdown.codegen.program`, all are plain functions.
 
 from __future__ import annotations
 
+import ast
+import functools
+import inspect
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -24,35 +28,20 @@ MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
 LOCAL = ("found_direction", "found_sigma", "found_usual", "found_variance")
 """Arrays of :data:`strapdown.kernels.live_imu.PASSING` that a branch writes: those are local arrays of the target."""
-FIELD = {
-    "held": "last mean field and specific force",
-    "vertical": "specific force, low-pass filtered once and twice",
-    "mean": "mean field: as measured, without the iron that appears, without the iron subtracted",
-    "deviation": "square deviation of each",
-    "ordered": "values of magnitude and dip of each, in order of size",
-    "median": "their medians",
-    "ring": "field, attitude by the gyro and whether known of the last second",
-    "sums": "normal equations of the iron",
-    "iron": "iron",
-    "total": "sum of the directions of a heading, and of their information",
-    "strength": "first usual magnitude",
-    "start": "time of the first sample, s; number of the last heading's interval",
-    "ring_time": "times of the last second, s",
-    "counted": "of the field's memory",
-    "stride": "of the values in order",
-}
-"""Arrays of :class:`strapdown.kernels.headings.Memory`."""
-REST = {
-    "tenths": "sums of the rate over the parts of this second",
-    "halves": "sums of specific force and field over its halves",
-    "rest_rate": "last rate at rest, rad/s",
-    "rest_variance": "its variance, and that of the bias by all rests",
-    "rest_clock": "time of the first sample of this second, and of the last rest, s",
-    "halves_number": "number of samples in the halves",
-    "resting": "samples in this second; 1: a rest, 2: the next step begins with it",
-}
-"""Arrays of :class:`strapdown.kernels.rests.Memory`."""
 TIMES = ("start", "ring_time", "rest_clock")
+
+
+@functools.cache
+def words_of(memory: type) -> dict[str, str]:
+    """Return what each array of a memory is: the string after it in its class."""
+    (tree,) = ast.parse(inspect.getsource(memory)).body
+    assert isinstance(tree, ast.ClassDef)
+    words = {
+        ast.unparse(line.target): ast.literal_eval(text.value).rstrip(".")
+        for line, text in itertools.pairwise(tree.body)
+        if isinstance(line, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+    return {name: text[0].lower() + text[1:] for name, text in words.items()}
 
 
 class Array(NamedTuple):
@@ -86,11 +75,8 @@ class Recording:
             for name in live_imu.LASTING
             if self.magnetometer or name not in of_field
         }
-        if self.magnetometer:
-            arrays |= {name: getattr(self.field, name) for name in FIELD}
-        if self.imu.rests:
-            arrays |= {name: getattr(self.rest, name) for name in REST}
-        return arrays
+        arrays |= self.field._asdict() if self.magnetometer else {}
+        return arrays | (self.rest._asdict() if self.imu.rests else {})
 
     @property
     def arrays(self) -> tuple[Array, ...]:
@@ -99,8 +85,9 @@ class Recording:
             Array("q", (4,), "attitude at the last sample"),
             Array("variance", (6,), "variances of attitude and bias there"),
         ]
+        memory = words_of(headings.Memory) | words_of(rests.Memory)
         for name, array in self.lasting.items():
-            _, kind, words = live_imu.LASTING.get(name) or ((), "", (FIELD | REST)[name])
+            _, kind, words = live_imu.LASTING.get(name) or ((), "", memory[name])
             kind = "int" if array.dtype == np.int64 else "wide" if name in TIMES else kind
             out.append(Array(name, array.shape, words, kind))
         return tuple(sorted(out, key=lambda array: ("", "wide", "int").index(array.kind)))

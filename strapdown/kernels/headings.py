@@ -96,17 +96,17 @@ class Memory(NamedTuple):
     mean: np.ndarray
     """Mean field: as measured, without the iron that appears, without the iron subtracted (3, 3)."""
     deviation: np.ndarray
-    """Square deviation of each (3,)."""
+    """Square deviation from each of these means (3,)."""
     ordered: np.ndarray
     """Values of magnitude and dip of each, in order of size (6, capacity)."""
     stride: np.ndarray
-    """Number of these values and steps from one to the next (6, 2)."""
+    """Number of the values in order, and of steps from one to the next (6, 2)."""
     median: np.ndarray
-    """(6,)"""
+    """Their medians (6,)."""
     ring: np.ndarray
-    """Field (3), attitude (4), and whether known, of the last ``lag`` steps (lag, 8)."""
+    """Field (3), attitude by the gyro (4), and whether known, of the steps of the last second (lag, 8)."""
     ring_time: np.ndarray
-    """Their times, s (lag,)."""
+    """Times of the steps in the ring, s (lag,)."""
     sums: np.ndarray
     """Normal equations of the iron (9,)."""
     iron: np.ndarray

@@ -42,9 +42,9 @@ class Memory(NamedTuple):
     halves: np.ndarray
     """Sums of specific force and field over its halves (4, 3)."""
     halves_number: np.ndarray
-    """Number of samples in them (4,)."""
+    """Number of samples in the halves (4,)."""
     resting: np.ndarray
-    """Number of samples in the span; 1 if a rest was found that shows more of the bias than is known (2,)."""
+    """Number of samples in the span; 1: it was a rest that shows more of the bias than is known, 2: the next step begins with it (2,)."""
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
