@@ -2,9 +2,9 @@
 
 - ``design``: The setup and its sensors as a program; refusals.
 - ``program``: The filter sample by sample, with checks, flags and a gate, around the formulas of the kernels.
-- ``recording``: That of an IMU, around the filter's steps.
+- ``recording``: That of an IMU, around the functions of :mod:`strapdown.kernels.live_imu`.
 - ``symbols``: Operations, recorded.
-- ``interpreted``: Kernels executed on symbols.
+- ``interpreted``: These functions and the kernels, executed on symbols.
 - ``functions``: A function of the target: statements, branches, calls.
 - ``regions``: The block to which each operation belongs.
 - ``target``: All functions of a filter, traced.

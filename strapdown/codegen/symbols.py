@@ -1,4 +1,4 @@
-"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes kernels on them, and equal operations are recorded once.
+"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes functions on them, and equal operations are recorded once.
 
 A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. What differs between two
 outcomes without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
@@ -28,9 +28,7 @@ class Symbol:
         """``"int"``, ``"wide"`` (of times, which are double in single precision too), or ``""``."""
 
     def __bool__(self) -> bool:
-        raise TypeError(
-            f"a condition ({self.kind}) that is known only on the target; use the machine's branch or select"
-        )
+        raise TypeError(f"a condition ({self.kind}) that is known only on the target; write an if, or select")
 
     def __add__(self, other: Any) -> Any:
         return NotImplemented if isinstance(other, list) else self.trace.sum(self, other)
@@ -164,7 +162,7 @@ class Trace:
                 return y if x == (kind == "&&") else x
         return self.symbol(kind, a, b)
 
-    # ------------------------------------------------------------------------------------ the functions that kernels leave to the machine
+    # ------------------------------------------------------------------------------------ functions that kernels find by these names
 
     def square_root(self, x: Any) -> Any:
         """Return √x."""
