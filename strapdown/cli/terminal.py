@@ -72,6 +72,7 @@ _EXTRA: dict[str, Any] = {
     "json": Option(None, "--json", help="File for all numbers; - for standard output."),
 }
 """Options that :func:`command` adds and serves."""
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
 OUTPUTS = ("out", "to", "target", "aligned", "json", "tables")
 """Parameters of commands that name files to write; paths in all others are read."""
 CANNOT_TELL = 3
@@ -131,9 +132,6 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
         return app.command()(run)
 
     return registered
-
-
-KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
 def _parameters(function: Callable[..., Any], hints: dict[str, Any]) -> Iterator[inspect.Parameter]:
