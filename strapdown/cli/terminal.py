@@ -24,6 +24,7 @@ from rich import box
 from rich.console import Console
 from rich.text import Text
 from typer import Option
+from typer.models import OptionInfo
 
 from strapdown.checks import Hint, InputError
 from strapdown.files import json_text, reading, usable_folder, writable, write_json
@@ -112,7 +113,13 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
             for name in groups:
                 fields = [field.name for field in dataclasses.fields(hints[name])]
                 values[name] = hints[name](**{field: values.pop(field) for field in fields})
-            numbers = function(**values) or {}
+            try:
+                numbers = function(**values) or {}
+            except InputError as error:  # of an argument of Python: named as the option
+                argument, blank, words = str(error).partition(" ")
+                if argument in options:
+                    error.args = (f"{option(Hint(argument))}{blank}{words}",)
+                raise
             if printed:
                 sys.stdout.write(json_text(numbers))
             elif target is not None:
@@ -126,6 +133,7 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
                 raise typer.Exit(STATUS.get(numbers["verdict"], CANNOT_TELL))
 
         parameters = list(_parameters(function, hints))
+        options = {parameter.name for parameter in parameters if isinstance(parameter.default, OptionInfo)}
         parameters += [inspect.Parameter(name, KEYWORD, default=_EXTRA[name], annotation=Path | None) for name in extra]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
