@@ -127,7 +127,7 @@ def test_the_doctor_says_it_at_the_top(run, succeeds, tmp_path):
     status, text, _ = run("doctor", file_of(iphone(), tmp_path / "phone.csv"))
     assert status == 3
     assert "cannot tell" in text.splitlines()[0]
-    assert text.splitlines()[1].startswith("warning: phone.csv: at rest the accelerometer reads -9.81 m/s² along z")
+    assert text.splitlines()[1].startswith("warning: at rest the accelerometer reads -9.81 m/s² along z")
     text = succeeds("doctor", file_of(walk(), tmp_path / "walk.csv"))
     assert "warning" not in text
 
