@@ -166,7 +166,7 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
         ax.set_title("NIS" if subset is None else f"NEES of the {subset}")
     axes[0].set_ylabel("mean per degree of freedom")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False, markerscale=4)
     figure.suptitle(
         f"Filters whose Q or R is wrong by a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) with the filter's gains (lines)"
     )

@@ -25,6 +25,7 @@ import numpy as np
 from strapdown import coning
 from strapdown.coning import ALGORITHMS, Algorithm
 from strapdown.files import atomic_write, write_json
+from strapdown.plots import style
 from strapdown.units import DEGREE
 
 DIGITS = 50
@@ -600,7 +601,8 @@ def draw(result: Result, folder: Path) -> list[Path]:
 
     def saved(name: str, figure: Any) -> None:
         path = folder / f"{name}.png"
-        with atomic_write(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 3}):
+        style.label_alike(figure)
+        with atomic_write(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 5}):
             figure.savefig(temporary, dpi=140, bbox_inches="tight")
         plt.close(figure)
         paths.append(path)

@@ -579,6 +579,19 @@ def test_a_backend_that_matplotlib_does_not_know_is_reported_in_one_line(tmp_pat
     assert "correct the environment variable MPLBACKEND" in done.stdout
 
 
+@pytest.mark.parametrize(("limits", "powers"), [((0.5, 3e7), True), ((2e-6, 1.0), True), ((0.5, 5e4), False)])
+def test_a_logarithmic_axis_is_labelled_in_one_style(tmp_path, limits, powers):
+    """The figure of the unknown start had 10000 beside 10⁶."""
+    figure, ax = plots.new_figure()
+    ax.set(yscale="log", ylim=limits)
+    style.save(figure, tmp_path / "figure.png")
+    with plots.style.theme("light"):
+        ticks = ax.get_yticklabels()
+    labels = [tick.get_text() for tick in ticks if limits[0] <= tick.get_position()[1] <= limits[1]]
+    assert len(labels) >= 3
+    assert {"10^" in label for label in labels} == {powers}
+
+
 @pytest.mark.parametrize("limits", [(3e-3, 6e-3), (0.8, 1.3), (1e-4, 1e3)])
 def test_a_logarithmic_axis_has_several_labels_that_are_their_values(limits):
     figure, ax = plots.new_figure()

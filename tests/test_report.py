@@ -183,6 +183,7 @@ def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
 def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folder):
     statistics = sd.read(folder / "campaign.h5").statistics
     (chart,) = (one for one in charts_of(body(folder / "campaign.html")) if one["title"].startswith("|bias y error|"))
+    assert chart["log"]  # from 26 to 0.4 °/h
     assert chart["unit"].endswith("°/h")
     assert [one["label"].split(" %")[0] for one in chart["series"]] == ["99", "50", "99", "50"]
     sigma = statistics.sigma[:, 4] / DEGREE_PER_HOUR
@@ -279,6 +280,13 @@ def test_a_coning_study_is_reported_from_its_json(coning_json, tmp_path):
     for one in study["filter"]:
         shown = rows_of(content.split("The same filter")[-1], f"{one['integration']}")
         np.testing.assert_allclose(shown[2], one["bias_rms_deg_per_hour"], rtol=6e-4)
+    if headless.CHROMIUM is not None:  # names side by side where there is room, else aslant
+        turned = DRAWN.replace(
+            "{drawn}", "{turned: (({plot}) => plot.axes[0].rotate(plot))(strapdownCharts.drawn()[0])}"
+        )
+        for width, angle in ((1280, 0), (500, 30)):
+            page_here = coning_json.with_suffix(".html")
+            assert headless.reported(page_here, turned, width, "--virtual-time-budget=20000")["turned"] == angle
     (tmp_path / "broken.json").write_text(json.dumps({**study, "filter": [{}]}), encoding="utf-8")
     with pytest.raises(InputError, match="does not fit a coning study"):
         report.write(tmp_path / "broken.json")

@@ -641,7 +641,7 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
     figure = drawing.before_and_after(compared, title="both")
     assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == [
-        "NIS per degree of freedom (log scale)",
+        "NIS per degree of freedom\n(log scale)",
         "NEES of the attitude",
         "NEES of the bias",
     ]

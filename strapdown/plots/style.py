@@ -14,7 +14,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullLocator
 
 from strapdown.checks import one_of
 from strapdown.files import atomic_write
@@ -123,6 +123,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     Path
         The file written.
     """
+    label_alike(figure)
     undated: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     with atomic_write(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # characters of a file name, drawn as boxes
@@ -138,6 +139,15 @@ def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
         for other in set(FORMATS) - {form}:
             path.with_suffix(f".{other}").unlink(missing_ok=True)
     return written
+
+
+def label_alike(figure: Figure) -> None:
+    """Label logarithmic axes that reach 100,000 or 0.00001 by powers of ten throughout: Matplotlib would write 10000 beside 10⁵."""
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)):
+        if axis.get_scale() == "log" and type(axis.get_major_formatter()) is LogFormatterSciNotation:
+            low, high = axis.get_view_interval()
+            if low <= 1e-5 or high >= 1e5:
+                axis.set_major_formatter(lambda value, _: f"$\\mathdefault{{10^{{{np.log10(value):.0f}}}}}$")
 
 
 class _LogLocator(LogLocator):

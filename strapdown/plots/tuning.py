@@ -100,7 +100,7 @@ def _course(
     finite = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
     if finite.max() > 5.0 or finite.min() < 0.2:
         style.log_scale(ax)
-        label += " (log scale)"
+        label += "\n(log scale)"
     ax.axhline(1.0, color=style.ink(), linewidth=0.6, linestyle=":")
     ax.set_ylabel(label)
     style.legend_above(ax)

@@ -52,9 +52,13 @@
     const named = content.ticks.length > 0;
     const axis = { stroke: colour("--ink"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
     const shown = (u, value) => (value == null ? "–" : Number(value).toPrecision(5));
+    const letters = Math.max(...content.ticks.map((name) => name.length));
+    const steep = (u) => content.ticks.length * (7 * letters + 10) > u.width - 90; // names would run into each other
     const names = named
-      ? { splits: () => content.ticks.map((_, k) => k), values: () => content.ticks, rotate: content.ticks.length > 6 ? -30 : 0, size: 70 }
+      ? { splits: () => content.ticks.map((_, k) => k), values: () => content.ticks, rotate: (u) => (steep(u) ? 30 : 0), size: (u) => (steep(u) ? 70 : 36) }
       : {};
+    const decades = (u, splits) => splits.map((value) => (Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-9 ? value : null));
+    const grid = (log) => ({ ...axis.grid, ...(log ? { filter: decades } : {}) }); // its lines between decades would be a grey area
     const vertical = content.range
       ? { range: (u, low, high) => (u.zoomed ? [low, high] : content.range) }
       : content.log ? { distr: 3 } : {};
@@ -66,7 +70,10 @@
         height: 260,
         cursor: { sync: named ? undefined : { key: content.x }, drag: { x: true, y: false } },
         scales: { x: { time: false, distr: content.log_x ? 3 : 1, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
-        axes: [{ ...axis, label: named ? undefined : content.x, ...names }, { ...axis, label: content.unit, size: 70 }],
+        axes: [
+          { ...axis, grid: grid(content.log_x), label: named ? undefined : content.x, ...names },
+          { ...axis, grid: grid(content.log), label: content.unit, size: 70 },
+        ],
         series: [
           { label: content.x, value: named ? (u, value) => content.ticks[value] ?? "–" : shown },
           ...content.series.map((one, k) => ({
