@@ -8,6 +8,7 @@ not a formula; numba compiles it.
 from __future__ import annotations
 
 import dis
+import functools
 import inspect
 import math
 import operator
@@ -19,7 +20,6 @@ from typing import Any, ClassVar
 import numba
 import numpy as np
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from strapdown.kernels.packed import EMIT
@@ -41,6 +41,8 @@ class Trace:
     def __init__(self, typing: Any, target: Any = None, builder: Any = None) -> None:
         self.typing, self.target, self.builder = typing, target, builder
         self._implementations: dict[Any, Any] = {}
+        self.tuples: dict[int, tuple[Any, Any, Any]] = {}
+        """Tuples of symbols that are parts of one value, by identity: the tuple, its type, and a function that returns the value."""
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -82,6 +84,8 @@ class Trace:
             value = argument.value
         elif argument is None:
             value = self.target.get_dummy_value()
+        elif id(argument) in self.tuples:
+            value = self.tuples[id(argument)][2]()
         elif isinstance(argument, tuple):
             parts = [self.value(a, k) for a, k in zip(argument, kind, strict=True)]
             value = self.target.make_tuple(self.builder, kind, parts)
@@ -95,6 +99,8 @@ def type_of(value: Any) -> Any:
     if type(value) is Symbol:
         return value.type
     if isinstance(value, tuple):
+        if id(value) in Trace.now.tuples:
+            return Trace.now.tuples[id(value)][1]
         pytype = type(value) if hasattr(value, "_fields") else None
         return types.BaseTuple.from_types([type_of(item) for item in value], pytype)
     if not isinstance(value, bool | int | float | np.number | type(None)):
@@ -103,23 +109,39 @@ def type_of(value: Any) -> Any:
 
 
 def symbols(kind: Any, value: Any = None) -> Any:
-    """Return a value as a symbol, a tuple as a tuple of symbols."""
+    """Return a value, or a function that emits it when it is first needed, as a symbol, a tuple as a tuple of symbols."""
     if isinstance(kind, types.NoneType):
         return None
     if not isinstance(kind, types.BaseTuple):
         return Symbol(kind, value)
-    parts = [None] * len(kind) if value is None else cgutils.unpack_tuple(Trace.now.builder, value, len(kind))
-    inside = [symbols(k, part) for k, part in zip(kind, parts, strict=True)]
-    return kind.instance_class(*inside) if isinstance(kind, types.BaseNamedTuple) else tuple(inside)
+    whole = value if callable(value) else lambda: value
+    parts = [None if value is None else _part(Trace.now.builder, whole, i) for i in range(len(kind))]
+    inside = tuple(symbols(k, part) for k, part in zip(kind, parts, strict=True))
+    result = kind.instance_class(*inside) if isinstance(kind, types.BaseNamedTuple) else inside
+    if inside:
+        Trace.now.tuples[id(result)] = (result, kind, whole)
+    return result
+
+
+def _part(builder: Any, whole: Any, place: int) -> Any:
+    """Return a function that emits part of a tuple once: most parts of a tuple are not used."""
+    return functools.cache(lambda: builder.extract_value(whole(), place))
 
 
 class Symbol:
     """A value computed at run time."""
 
-    __slots__ = ("type", "value")
+    __slots__ = ("_value", "type")
 
     def __init__(self, kind: Any, value: Any) -> None:
-        self.type, self.value = kind, value
+        self.type, self._value = kind, value
+
+    @property
+    def value(self) -> Any:
+        """LLVM's value."""
+        if callable(self._value):
+            self._value = self._value()
+        return self._value
 
     def __len__(self) -> int:
         """Return the number of lanes."""
