@@ -166,11 +166,14 @@ class Plain:
 class Compiled:
     """The filter in C, compiled into a library: once for a program."""
 
+    _sources: ClassVar[dict[Any, tuple[Any, dict[str, str]]]] = {}
     _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
     def __init__(self, program, folder, *, single=False, flags=("-O1",)):
         folder = Path(folder)
-        files = c.files(program, "test", single=single)
+        if (id(program), single) not in self._sources:
+            self._sources[id(program), single] = program, c.files(program, "test", single=single)
+        files = self._sources[id(program), single][1]
         flags = (*flags, "-Wdouble-promotion") if single else flags
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")

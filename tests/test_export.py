@@ -127,17 +127,21 @@ def rows_of(name):
 
 
 @functools.cache
+def program(name, *, single=False):
+    record, setup, _ = case(name)
+    return program_of(setup, record.vectors, single=single)
+
+
+@functools.cache
 def plain(name):
     rows, start = rows_of(name)
-    record, setup, _ = case(name)
-    return fed(Plain(program_of(setup, record.vectors)), rows, start)
+    return fed(Plain(program(name)), rows, start)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_c_equals_python_to_the_bit(name, tmp_path):
-    record, setup, _ = case(name)
     rows, start = rows_of(name)
-    numbers, statuses = fed(Compiled(program_of(setup, record.vectors), tmp_path), rows, start)
+    numbers, statuses = fed(Compiled(program(name), tmp_path), rows, start)
     expected, expected_statuses = plain(name)
     assert statuses == expected_statuses
     assert np.isfinite(expected).all()
@@ -165,9 +169,8 @@ def test_recorded_samples_give_the_bits_of_python(broad, tmp_path):
 
 @pytest.mark.parametrize("name", CASES)
 def test_javascript_equals_python_to_the_bit(name, tmp_path):
-    record, setup, _ = case(name)
     rows, start = rows_of(name)
-    numbers, statuses = fed_javascript(program_of(setup, record.vectors), tmp_path, rows, start)
+    numbers, statuses = fed_javascript(program(name), tmp_path, rows, start)
     expected, expected_statuses = plain(name)
     assert statuses == expected_statuses
     np.testing.assert_array_equal(numbers, expected)
@@ -177,8 +180,7 @@ def test_the_cases_take_the_rare_branches():
     """Otherwise equality of bits would say nothing about them."""
     for name in ("gate", "precise"):
         rows, start = rows_of(name)
-        record, setup, _ = case(name)
-        f = Plain(program_of(setup, record.vectors))
+        f = Plain(program(name))
         _, statuses = fed(f, rows, start)
         assert statuses.count(0) > 0.9 * len(statuses)
         assert (2 in statuses) == (name == "gate")
@@ -187,8 +189,7 @@ def test_the_cases_take_the_rare_branches():
 
 
 def sources(name):
-    record, setup, _ = case(name)
-    return c.files(program_of(setup, record.vectors), "test", single=False)
+    return c.files(program(name), "test", single=False)
 
 
 @pytest.mark.parametrize(
@@ -230,13 +231,11 @@ def test_program_equals_the_compiled_filter(name):
 
 @pytest.mark.parametrize("name", ["every sensor", "drift", "bias", "hand"])
 def test_single_precision_within_a_thirtieth_of_sigma(name, tmp_path):
-    record, setup, _ = case(name)
     rows, start = rows_of(name)
-    program = program_of(setup, record.vectors, single=True)
-    compiled = Compiled(program, tmp_path, single=True)
+    compiled = Compiled(program(name, single=True), tmp_path, single=True)
     numbers, statuses = fed(compiled, rows, start)
     expected, expected_statuses = plain(name)
-    n, whole = program.n, len(rows) - 1
+    n, whole = compiled.program.n, len(rows) - 1
     assert np.mean(np.array(statuses) != expected_statuses) < 0.01
     P = np.zeros((n, n))
     P[np.triu_indices(n)] = expected[whole][n + 1 : n + 1 + n * (n + 1) // 2]
@@ -253,8 +252,8 @@ HOSTILE = [np.nan, np.inf, -np.inf, 1e9, -1e9, 1e300, 1e-300, 0.0]
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("name", ["every sensor", "scale", "bias", "correlated"])
 def test_hostile_samples_set_a_flag_and_leave_the_state_valid(name, single, tmp_path):
-    record, setup, start = case(name)
-    f = Compiled(program_of(setup, record.vectors, single=single), tmp_path, single=single)
+    _, _, start = case(name)
+    f = Compiled(program(name, single=single), tmp_path, single=single)
     n = f.program.n
     generator = np.random.default_rng(1)
     f.init(list(start))
@@ -290,8 +289,7 @@ def test_hostile_samples_set_a_flag_and_leave_the_state_valid(name, single, tmp_
 
 
 def test_a_bad_start_is_level_and_flagged(tmp_path):
-    record, setup, _ = case("direction")
-    f = Compiled(program_of(setup, record.vectors), tmp_path)
+    f = Compiled(program("direction"), tmp_path)
     for bad in ([np.nan, 0.0, 0.0, 0.0], [0.0] * 4, [np.inf, 0.0, 0.0, 0.0]):
         assert f.init(bad) == 1
         np.testing.assert_array_equal(f.numbers[:4], [1.0, 0.0, 0.0, 0.0])
@@ -328,9 +326,7 @@ int main(void) {
 @pytest.mark.parametrize("name", ["gate", pytest.param("drift", marks=pytest.mark.slow)])
 def test_sanitizers_find_nothing(name, tmp_path):
     gcc = compiler()
-    record, setup, _ = case(name)
-    program = program_of(setup, record.vectors)
-    updates = " ".join(f"strapdown_update_{sensor.name}(&f, v);" for sensor in program.sensors)
+    updates = " ".join(f"strapdown_update_{sensor.name}(&f, v);" for sensor in program(name).sensors)
     for file, text in {**sources(name), "main.c": SANITIZED.replace("UPDATES", updates)}.items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-conversion"]
@@ -552,8 +548,8 @@ def test_values_read_before_an_effect_are_those_before_it(tmp_path):
 
 def test_a_covariance_that_is_not_a_number_does_not_reach_the_attitude(tmp_path):
     """Memory of a microcontroller may be damaged; the attitude by the gyro alone goes on."""
-    record, setup, start = case("direction")
-    f = Compiled(program_of(setup, record.vectors), tmp_path)
+    _, _, start = case("direction")
+    f = Compiled(program("direction"), tmp_path)
     f.init(list(start))
     for i in range(21):
         f.state.P[i] = np.nan

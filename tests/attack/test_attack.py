@@ -40,9 +40,11 @@ class HangError(BaseException):
 
 def signature(error: BaseException) -> str:
     """Where an error came from, for the log: one kind a place."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "strapdown/" in frame.filename]
-    last = frames[-1] if frames else None
-    return f"{type(error).__name__} at {Path(last.filename).name}:{last.name}" if last else type(error).__name__
+    # Without the lines of the source, which take longer than to read a file.
+    codes = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
+    inside = [code for code in codes if "strapdown/" in code.co_filename]
+    place = f" at {Path(inside[-1].co_filename).name}:{inside[-1].co_name}" if inside else ""
+    return f"{type(error).__name__}{place}"
 
 
 def fault(target: Target, path: Path, content: bytes, damage: str) -> tuple[str, str]:
