@@ -1,6 +1,7 @@
 """One result, one verdict: the command, Python in memory, Python on a file, and the report agree in words, numbers and exit status."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,8 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
 
 
 def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
-    source = sd.write(sd.simulate("two-stars", seed=5), tmp_path / "record.h5")
+    short = replace(sd.scenarios.load_scenario("two-stars"), duration=60.0)
+    source = sd.write(sd.simulate(short, seed=5), tmp_path / "record.h5")
     for name, flags, estimator, options in (
         ("smooth", ("--smooth",), sd.smooth, {}),
         ("gate", ("--gate", "0.99"), sd.estimate, {"gate": 0.99}),
@@ -108,8 +110,6 @@ def held(record, initial):
 
 
 def test_a_filter_of_ones_own_by_every_way(tmp_path):
-    from dataclasses import replace
-
     scenario = replace(sd.scenarios.load_scenario("two-stars"), duration=20.0)
     setup = replace(sd.FilterSetup.for_scenario(scenario), estimator=held)
     plan = sd.montecarlo.Plan(scenario=scenario, setup=setup, epochs=10)
