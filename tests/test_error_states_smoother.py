@@ -117,7 +117,9 @@ def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
     dt = float(record.time[1] - record.time[0])
     prior = root_inverse(initial.covariance)
     phi = transition_of(blocks, dt)
-    whitening = np.array([root_inverse(driven(blocks, small.noise, one / dt, dt)) for one in record.increments])
+    whitening = np.array(
+        [root_inverse(driven(blocks, small.noise, increment / dt, dt)) for increment in record.increments]
+    )
     rows = [(s, np.searchsorted(record.time, s.time), turning_matrices(blocks, record, s)) for s in record.vectors]
 
     def residuals(x):
@@ -149,12 +151,12 @@ def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
         J = np.zeros((len(owner), edges, n))
         for group in range(3):
             mine = np.arange(group, edges, 3)
-            seen = np.where(owner % 3 == group, owner, later)
+            edge = np.where(owner % 3 == group, owner, later)
             hit = (owner % 3 == group) | (later % 3 == group)
             for i in range(n):
                 step = np.zeros_like(x)
                 step[mine, i] = h[i]
-                J[hit, seen[hit], i] = ((residuals(x + step) - residuals(x - step)) / (2.0 * h[i]))[hit]
+                J[hit, edge[hit], i] = ((residuals(x + step) - residuals(x - step)) / (2.0 * h[i]))[hit]
         J = J.reshape(len(owner), -1) * np.tile(h, edges)
         move = np.linalg.lstsq(J, -now, rcond=None)[0]
         move = move.reshape(edges, n) * h
@@ -217,9 +219,9 @@ def small_record(blocks, scale, *, seed=3, steps=8, dt=0.1, late=False, off=(1.0
         ("mag", FIELD, 0.02 * scale, np.array([steps]) if late else np.arange(2, steps + 1, 2)),
     ):
         nothing = np.zeros((len(at), 3))
-        one = series_of(name, "vector", time[at], nothing, reference, sigma)
-        z = predicted_vectors(blocks, one, q[at], c[at], turning_matrices(blocks, bare, one))
-        series.append(dataclasses.replace(one, vector_b=z + sigma * rng.standard_normal(z.shape)))
+        template = series_of(name, "vector", time[at], nothing, reference, sigma)
+        z = predicted_vectors(blocks, template, q[at], c[at], turning_matrices(blocks, bare, template))
+        series.append(dataclasses.replace(template, vector_b=z + sigma * rng.standard_normal(z.shape)))
     start = quaternion.multiply(q[0], quaternion.exp(0.1 * scale * np.array(off)))
     return Small(
         record=dataclasses.replace(bare, vectors=tuple(series)),
@@ -258,10 +260,10 @@ CARRIED = {
 
 def smoothed_beside_the_optimum(small: Small):
     """What :func:`beside_the_optimum` says of the smoother."""
-    found = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
-    rest = np.concatenate([found.bias, *(block.values for block in found.error_states.values())], axis=1)
-    P = found.covariance if found.whole_covariance is None else found.whole_covariance
-    return beside_the_optimum(small, found.attitude, rest, P)
+    estimate = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
+    rest = np.concatenate([estimate.bias, *(block.values for block in estimate.error_states.values())], axis=1)
+    P = estimate.covariance if estimate.whole_covariance is None else estimate.whole_covariance
+    return beside_the_optimum(small, estimate.attitude, rest, P)
 
 
 def slow(kinds, *which):
@@ -298,18 +300,18 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.1, 0.2, 2.0], bias_sigma=1e-9)
     true = quaternion.exp([0.1, -0.05, 1.3])
     felt = quaternion.rotate(quaternion.conjugate(true), np.array([0.6, -0.3, 10.01]))
-    found = []
+    estimates = []
     for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
         acc = series_of("acc", "vector", [at], [felt], UP, 0.05)
         mag = series_of("mag", "vector", [at], [seen(true, FIELD)], FIELD, 0.01)
-        found.append(run(resting(acc, mag), still, initial, blocks, full_covariance=True))
-    assert difference(*found, 0, 0) < 1e-6
-    assert np.linalg.norm(quaternion.log(found[0].attitude[0])) > 0.9
+        estimates.append(run(resting(acc, mag), still, initial, blocks, full_covariance=True))
+    assert difference(*estimates, 0, 0) < 1e-6
+    assert np.linalg.norm(quaternion.log(estimates[0].attitude[0])) > 0.9
 
 
 def pushed(kind: str, runs: int) -> np.ndarray:
     """NEES over its degrees of what is carried, of a body whose heading is found at the end: there, and smoothed amid (runs, 2)."""
-    found = np.empty((runs, 2))
+    nees = np.empty((runs, 2))
     for run in range(runs):
         rng = np.random.default_rng([run, 8])
         small = small_record((CARRIED[kind],), 0.03, seed=100 + run, late=True, off=rng.standard_normal(3))
@@ -320,16 +322,16 @@ def pushed(kind: str, runs: int) -> np.ndarray:
         true = np.einsum("kij,kjp->kip", turn, small.values.reshape(len(turn), 3, -1)).reshape(values.shape)
         edges = [-1, len(turn) // 2]
         P = estimate.whole_covariance[edges, 6:, 6:]
-        found[run] = consistency.nees((true - values)[edges], P) / values.shape[1]
-    return found
+        nees[run] = consistency.nees((true - values)[edges], P) / values.shape[1]
+    return nees
 
 
 @pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", slow(CARRIED, "velocity", "position"))
 def test_what_is_carried_is_consistent(kind, runs):
     """Of a heading found at the end; without the turn carried along, the filter's push of several tenths of g was off by 3 of its σ."""
-    found = pushed(kind, runs)
-    assert_inside(found.mean(axis=0), CARRIED[kind].size, runs, 0.999)
+    nees = pushed(kind, runs)
+    assert_inside(nees.mean(axis=0), CARRIED[kind].size, runs, 0.999)
 
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
@@ -358,15 +360,15 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
     return record, estimation.initial_state(attitude, attitude_sigma=0.05, bias_sigma=3e-3)
 
 
-def difference(one, other, k=slice(None), j=slice(None)):
+def difference(first, second, k=slice(None), j=slice(None)):
     """Largest difference of rows k of one estimate and j of another, in σ, and of covariances scaled to correlations."""
     mine, theirs = (
-        e.covariance[r] if e.whole_covariance is None else e.whole_covariance[r] for e, r in ((one, k), (other, j))
+        e.covariance[r] if e.whole_covariance is None else e.whole_covariance[r] for e, r in ((first, k), (second, j))
     )
     sigma = np.sqrt(np.einsum("...ii->...i", theirs))
-    off = turn_to(one.attitude[k], other.attitude[j])
-    parts = [off, one.bias[k] - other.bias[j]]
-    parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.error_states.items()]
+    off = turn_to(first.attitude[k], second.attitude[j])
+    parts = [off, first.bias[k] - second.bias[j]]
+    parts += [block.values[k] - second.error_states[name].values[j] for name, block in first.error_states.items()]
     P = (mine - theirs) / (sigma[..., :, None] * sigma[..., None, :])
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
@@ -395,15 +397,15 @@ def test_a_part_of_a_record_between_any_two_times():
     mag = record.vectors[0]
     begin, end = float(mag.time[2]), float(mag.time[7])
     middle = 0.5 * (record.time[40] + record.time[41])
-    one, other = recovery_segments.part(record, begin, middle), recovery_segments.part(record, middle, end)
-    assert (one.time[0], one.time[-1], other.time[-1]) == (begin, middle, end)
+    first, second = recovery_segments.part(record, begin, middle), recovery_segments.part(record, middle, end)
+    assert (first.time[0], first.time[-1], second.time[-1]) == (begin, middle, end)
     edges = np.cumsum(np.vstack([np.zeros(3), record.increments]), axis=0)
     turned = [np.interp([begin, middle, end], record.time, edges[:, i]) for i in range(3)]
-    whole = np.array([one.increments.sum(axis=0), other.increments.sum(axis=0)])
+    whole = np.array([first.increments.sum(axis=0), second.increments.sum(axis=0)])
     np.testing.assert_allclose(whole.T, np.diff(turned), rtol=0, atol=1e-15)
-    seen = [np.flatnonzero(~np.isnan(p.vectors[0].vector_b[:, 0])).tolist() for p in (one, other)]
-    assert seen == [[2, 3, 4, 5, 6][: len(seen[0])], [2, 3, 4, 5, 6][len(seen[0]) :]]
-    assert len(one.vectors[0].time) == len(mag.time)
+    rows = [np.flatnonzero(~np.isnan(p.vectors[0].vector_b[:, 0])).tolist() for p in (first, second)]
+    assert rows == [[2, 3, 4, 5, 6][: len(rows[0])], [2, 3, 4, 5, 6][len(rows[0]) :]]
+    assert len(first.vectors[0].time) == len(mag.time)
 
 
 def test_what_is_smoothed_of_a_recovery_and_what_is_not():
@@ -449,9 +451,9 @@ def jumped(lost: float, blocks) -> tuple[ImuRecord, estimation.State]:
         ("acc", UP, 0.05, slice(1, 31, 2), errors[0]),
         ("mag", FIELD, 0.01, slice(2, 31, 2), errors[1]),
     ):
-        seen = quaternion.rotate(back[at], reference) + error[at]
-        seen = seen + sigma * rng.standard_normal(seen.shape)
-        series.append(series_of(name, "vector", time[at], seen, reference, sigma))
+        vector_b = quaternion.rotate(back[at], reference) + error[at]
+        vector_b = vector_b + sigma * rng.standard_normal(vector_b.shape)
+        series.append(series_of(name, "vector", time[at], vector_b, reference, sigma))
     start = SPUN.attitude(np.array(0.0))
     initial = estimation.initial_state(start, attitude_sigma=0.03, bias=bias, bias_sigma=3e-3)
     initial = estimation.with_error_states(initial, blocks)
@@ -489,9 +491,9 @@ def test_a_trajectory_begins_with_its_candidate(lost, since, blocks):
     kept = np.repeat([1.0, math.exp(-begin / 0.4)], 3)[: len(initial.values)]
     fresh = dataclasses.replace(fresh, values=kept * initial.values)
     rest = Small(record=rest, noise=NOISY, initial=fresh, blocks=aged)
-    found = np.concatenate([both.bias, *(block.values for block in both.error_states.values())], axis=1)[since:]
+    values = np.concatenate([both.bias, *(block.values for block in both.error_states.values())], axis=1)[since:]
     P = both.whole_covariance if blocks else both.covariance
-    off, ratio = beside_the_optimum(rest, both.attitude[since:], found, P[since:])
+    off, ratio = beside_the_optimum(rest, both.attitude[since:], values, P[since:])
     assert np.max(off) < 0.1
     np.testing.assert_allclose(ratio, 1.0, rtol=0.04)
 
@@ -505,19 +507,19 @@ def test_the_parts_about_a_recovery_keep_the_unit_of_the_start():
     sigma = np.geomspace(0.01, 0.05, len(unit))
     mag = dataclasses.replace(mag, kind="direction", vector_b=unit, sigma=sigma)
     record = dataclasses.replace(record, vectors=(mag, acc))
-    found = []
+    estimates = []
     for ratio in (1.0, 3.0):
         blocks = (error_states.VectorBias(sensor="mag", bias_sigma=0.05 * ratio, varying=True),)
         start = dataclasses.replace(
             estimation.with_error_states(initial, blocks),
             unit_sigma={} if ratio == 1.0 else {"mag": ratio * float(np.sqrt(np.mean(sigma**2)))},
         )
-        found.append(estimation.smooth(record, NOISE, start, blocks, gate=GATE))
-    one, other = found
-    assert recoveries(one) == recoveries(other)
-    assert len(recoveries(one)) == 1
-    np.testing.assert_allclose(one.attitude, other.attitude, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(one.variance, other.variance, rtol=1e-7)
+        estimates.append(estimation.smooth(record, NOISE, start, blocks, gate=GATE))
+    first, second = estimates
+    assert recoveries(first) == recoveries(second)
+    assert len(recoveries(first)) == 1
+    np.testing.assert_allclose(first.attitude, second.attitude, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(first.variance, second.variance, rtol=1e-7)
 
 
 @pytest.mark.slow
@@ -535,8 +537,8 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
     ahead = estimation.run(bare, NOISE, begun, blocks, full_covariance=True)
     aged, covariance = aged_prior(blocks, *forward.restart_states(begun, blocks), 2.0)
     sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
-    found = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
-    np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)
+    expected = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
+    np.testing.assert_allclose(aged / sigma, expected / sigma, rtol=0, atol=1e-8)
     scale = np.outer(sigma, sigma)
     np.testing.assert_allclose(covariance / scale, ahead.whole_covariance[-1][6:, 6:] / scale, rtol=0, atol=1e-8)
 

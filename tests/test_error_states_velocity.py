@@ -71,9 +71,9 @@ def exactly(A: np.ndarray, q: np.ndarray, dt: float, digits: int = 60) -> tuple[
             whole[i, n + i] = mpmath.mpf(float(q[i]))
             for j in range(n):
                 whole[i, j], whole[n + i, n + j] = -mpmath.mpf(float(A[i, j])), mpmath.mpf(float(A[j, i]))
-        found = mpmath.expm(whole * mpmath.mpf(dt))
-        phi = found[n:, n:].T
-        Q = phi * found[:n, n:]
+        exponential = mpmath.expm(whole * mpmath.mpf(dt))
+        phi = exponential[n:, n:].T
+        Q = phi * exponential[:n, n:]
         return (np.array(m.tolist(), float) for m in (phi, Q))
 
 
@@ -207,8 +207,8 @@ def test_two_of_three_give_the_third():
         three = {name: getattr(whole, name) for name in ("velocity_sigma", "acceleration_sigma", "acceleration_time")}
         times = {name: getattr(whole, name) for name in ("velocity_time", "position_time")}
         for left_out, third in three.items():
-            given = {name: value for name, value in three.items() if name != left_out}
-            other = error_states.BoundedVelocity(sensor="acc", strength=1.0, **times, **given)
+            parameters = {name: value for name, value in three.items() if name != left_out}
+            other = error_states.BoundedVelocity(sensor="acc", strength=1.0, **times, **parameters)
             assert getattr(other, left_out) == pytest.approx(third, rel=1e-12)
             np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-9)
         assert dataclasses.replace(whole, name="other").acceleration_sigma == whole.acceleration_sigma
@@ -240,7 +240,7 @@ def acceleration_path(block: error_states.BoundedVelocity, time: np.ndarray, rng
     A, q = system(block)
     P = scipy.linalg.solve_continuous_lyapunov(A, -np.diag(q))
     c = np.linalg.cholesky(P) @ rng.standard_normal(block.size)
-    found = [c]
+    path = [c]
     roots: dict[float, tuple] = {}
     for dt in np.round(np.diff(time), 12):
         if dt not in roots:
@@ -249,8 +249,8 @@ def acceleration_path(block: error_states.BoundedVelocity, time: np.ndarray, rng
             roots[dt] = phi, vector * np.sqrt(np.maximum(value, 0.0))
         phi, root = roots[dt]
         c = phi @ c + root @ rng.standard_normal(block.size)
-        found.append(c)
-    states = np.array(found)
+        path.append(c)
+    states = np.array(path)
     row = outputs(block)["acceleration"]
     return {"states": states, "acceleration": states.reshape(len(time), 3, -1) @ row}
 
@@ -319,8 +319,8 @@ def test_both_faces_agree(option, kind):
     fast = estimation.run(record, NOISE, state, blocks, full_covariance=True)
     slow = in_steps.run(record, NOISE, state, blocks)
     assert in_steps.apart(fast, slow) < 1e-9
-    for name, one in fast.innovations.items():
-        np.testing.assert_allclose(slow.whitened[name], one.whitened, rtol=1e-7, atol=1e-9)
+    for name, innovations in fast.innovations.items():
+        np.testing.assert_allclose(slow.whitened[name], innovations.whitened, rtol=1e-7, atol=1e-9)
 
 
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
@@ -381,12 +381,14 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     )
     record = ImuRecord(time=time, increments=increments, vectors=series)
     initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
-    found = estimation.smooth(record, NOISE, initial, (block,), full_covariance=True)
+    estimate = estimation.smooth(record, NOISE, initial, (block,), full_covariance=True)
     wanted, variance = least_squares(record, block)
-    values = np.concatenate([quaternion.log(found.attitude), found.bias, found.error_states[block.name].values], axis=1)
+    values = np.concatenate(
+        [quaternion.log(estimate.attitude), estimate.bias, estimate.error_states[block.name].values], axis=1
+    )
     sigma = np.sqrt(variance)
     assert np.max(np.abs(values - wanted) / sigma) < 1e-3 * np.max(np.abs(wanted) / sigma)
-    np.testing.assert_allclose(np.einsum("kii->ki", found.whole_covariance), variance, rtol=1e-4)
+    np.testing.assert_allclose(np.einsum("kii->ki", estimate.whole_covariance), variance, rtol=1e-4)
 
 
 def test_a_gap_of_many_correlation_times_forgets_the_velocity():
@@ -433,7 +435,7 @@ def judged(
     """Errors and their NEES at five epochs of the second half of many records of the block's own making, (runs, 5, …)."""
     truth_block = block_of(poles, speed)
     blocks, sigma = MODELS[model](truth_block)
-    found: dict[str, list] = {"attitude": [], "bias": [], "block": [], "all": [], "error": []}
+    statistics: dict[str, list] = {"attitude": [], "bias": [], "block": [], "all": [], "error": []}
     for seed in range(number):
         record, truth = record_of(truth_block, seed, duration=duration)
         series = (dataclasses.replace(record.vectors[0], sigma=np.full(len(record.vectors[0].time), sigma)),)
@@ -454,9 +456,9 @@ def judged(
         for name, part in parts.items():
             if name in ("block", "all") and model != "bounded velocity":
                 continue
-            found[name].append(consistency.nees(e[:, part], P[:, part, part]) / e[:, part].shape[1])
-        found["error"].append(np.linalg.norm(e[:, :2], axis=1))
-    return {name: np.array(values) for name, values in found.items() if values}
+            statistics[name].append(consistency.nees(e[:, part], P[:, part, part]) / e[:, part].shape[1])
+        statistics["error"].append(np.linalg.norm(e[:, :2], axis=1))
+    return {name: np.array(values) for name, values in statistics.items() if values}
 
 
 def _as_estimated(states: np.ndarray, true_attitude: np.ndarray, attitude: np.ndarray) -> np.ndarray:
@@ -472,11 +474,11 @@ def _as_estimated(states: np.ndarray, true_attitude: np.ndarray, attitude: np.nd
 )
 def test_the_filter_is_consistent_on_what_it_models(poles, smoothed):
     """Five epochs and four parts: bounds of 99.9 % each, so that all twenty hold in 98 of 100 tries."""
-    found = judged(poles, "bounded velocity", 24, 6.0, smoothed)
+    statistics = judged(poles, "bounded velocity", 24, 6.0, smoothed)
     size = block_of(poles).size
     for part, degrees in (("attitude", 3), ("bias", 3), ("block", size), ("all", 6 + size)):
         low, high = consistency.mean_bounds(degrees, 24, 0.999)
-        anees = found[part].mean(axis=0)
+        anees = statistics[part].mean(axis=0)
         assert np.all((low < anees) & (anees < high)), (part, anees, low, high)
 
 
@@ -485,13 +487,13 @@ def test_other_models_of_the_acceleration_are_worse():
     """As many runs: what lasts of first-order noise passes for tilt, white noise as large gives up what the velocity bounds, and without
     any the filter follows each push.
     """
-    found = {model: judged("velocity", model, 24, 12.0) for model in MODELS}
-    tilt = {model: np.sqrt(np.mean(one["error"] ** 2)) for model, one in found.items()}
+    outcomes = {model: judged("velocity", model, 24, 12.0) for model in MODELS}
+    tilt = {model: np.sqrt(np.mean(outcome["error"] ** 2)) for model, outcome in outcomes.items()}
     assert tilt["coloured"] > 1.7 * tilt["bounded velocity"], tilt
     assert tilt["white"] > 1.1 * tilt["bounded velocity"], tilt
     assert tilt["none"] > 3.0 * tilt["bounded velocity"], tilt
-    assert found["none"]["attitude"].mean() > 20.0
-    assert found["coloured"]["attitude"].mean() < 0.85 < found["bounded velocity"]["attitude"].mean()
+    assert outcomes["none"]["attitude"].mean() > 20.0
+    assert outcomes["coloured"]["attitude"].mean() < 0.85 < outcomes["bounded velocity"]["attitude"].mean()
 
 
 @pytest.mark.slow
@@ -503,10 +505,10 @@ def test_consistency_over_many_runs(poles, smoothed):
 
     At half a metre a second the errors are large enough for what is of second order to show: ANEES is 1.02 to 1.05.
     """
-    found = judged(poles, "bounded velocity", 400, 6.0, smoothed, speed=0.1)
+    statistics = judged(poles, "bounded velocity", 400, 6.0, smoothed, speed=0.1)
     size = block_of(poles).size
     for part, degrees in (("attitude", 3), ("bias", 3), ("block", size), ("all", 6 + size)):
-        assert_inside(found[part][:, -1].mean(), degrees, 400, 0.999)
+        assert_inside(statistics[part][:, -1].mean(), degrees, 400, 0.999)
 
 
 # ------------------------------------------------------------------------------------------------------------------ setups and files
@@ -515,27 +517,31 @@ TOLD = SensorStates(velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1
 
 
 @pytest.mark.parametrize(
-    "one",
+    "sensor_states",
     [
         TOLD,
         SensorStates(velocity_time=0.3, velocity_sigma=0.1, acceleration_sigma=2.0, position_time=1.0, bias_sigma=0.2),
         SensorStates(velocity_time=0.3, acceleration_sigma=2.0, acceleration_time=0.123456789),
     ],
 )
-def test_a_setup_holds_it_to_the_last_bit(one):
-    chosen = setup.FilterSetup(process_noise=NOISE, bias_sigma=1e-3, states=States(sensors={"acc": one}))
-    text = setup.to_toml(chosen)
-    assert setup.from_toml(text) == chosen
+def test_a_setup_holds_it_to_the_last_bit(sensor_states):
+    filter_setup = setup.FilterSetup(
+        process_noise=NOISE, bias_sigma=1e-3, states=States(sensors={"acc": sensor_states})
+    )
+    text = setup.to_toml(filter_setup)
+    assert setup.from_toml(text) == filter_setup
     assert "velocity_time_s = 0.3" in text
-    assert "acc.velocity" in chosen.states.names
-    kept = chosen.states.select(("acc.velocity",))
-    assert kept.sensors["acc"] == dataclasses.replace(one, bias_sigma=0.0)
-    if _more_than_velocity(one):
-        assert chosen.states.select(("acc.bias",)).sensors["acc"] == SensorStates(bias_sigma=one.bias_sigma)
+    assert "acc.velocity" in filter_setup.states.names
+    kept = filter_setup.states.select(("acc.velocity",))
+    assert kept.sensors["acc"] == dataclasses.replace(sensor_states, bias_sigma=0.0)
+    if _more_than_velocity(sensor_states):
+        assert filter_setup.states.select(("acc.bias",)).sensors["acc"] == SensorStates(
+            bias_sigma=sensor_states.bias_sigma
+        )
 
 
-def _more_than_velocity(one: SensorStates) -> bool:
-    return one.bias_sigma != 0.0
+def _more_than_velocity(sensor_states: SensorStates) -> bool:
+    return sensor_states.bias_sigma != 0.0
 
 
 def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
@@ -549,12 +555,12 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
 
 def test_a_setup_runs_it():
     record, _ = record_of(block_of("velocity"))
-    chosen = setup.FilterSetup(process_noise=NOISE, bias_sigma=3e-3, states=States(sensors={"acc": TOLD}))
-    found = setup.run(record, chosen, start())
+    filter_setup = setup.FilterSetup(process_noise=NOISE, bias_sigma=3e-3, states=States(sensors={"acc": TOLD}))
+    estimate = setup.run(record, filter_setup, start())
     same = estimation.run(record, NOISE, start(), (dataclasses.replace(block_of("velocity"), name=""),))
-    np.testing.assert_allclose(found.attitude, same.attitude, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(estimate.attitude, same.attitude, rtol=0, atol=1e-12)
     np.testing.assert_allclose(
-        found.error_states["acc velocity"].values, same.error_states["acc velocity"].values, atol=1e-10
+        estimate.error_states["acc velocity"].values, same.error_states["acc velocity"].values, atol=1e-10
     )
 
 
@@ -579,33 +585,33 @@ def errors_of(used: Recording, attitude: np.ndarray) -> dict[str, float]:
 
 def errors_by(recording: Recording, parameters: ahrs.AhrsParameters, **options) -> dict[str, float]:
     """The same of the filter of these beliefs."""
-    found = ahrs.estimate(recording, parameters, **options)
-    return errors_of(found.recording, found.estimate.attitude)
+    result = ahrs.estimate(recording, parameters, **options)
+    return errors_of(result.recording, result.estimate.attitude)
 
 
 def test_the_simulated_hand_moves_as_its_accelerometer_says():
     """The acceleration is the second derivative of a path that begins at rest; where it rests, the sensor feels the vertical alone."""
     t, h, phase = np.linspace(0.01, 6.0, 500)[:, None], 1e-4, np.array([0.3, 2.0, 4.4])
-    (before, _), (here, found), (after, _) = (hand_held.swelling(t + step, 6.9, phase) for step in (-h, 0.0, h))
-    np.testing.assert_allclose(found, (after - 2.0 * here + before) / h**2, atol=2e-5)
+    (before, _), (here, acceleration), (after, _) = (hand_held.swelling(t + step, 6.9, phase) for step in (-h, 0.0, h))
+    np.testing.assert_allclose(acceleration, (after - 2.0 * here + before) / h**2, atol=2e-5)
     assert np.abs(hand_held.swelling(np.array([0.0]), 6.9, phase)).max() == 0.0
-    one = hand_held.simulated(1, 0, 10.0)
-    fixed = quaternion.rotate(one.true_attitude, one.specific_force) - np.array([0.0, 0.0, 9.81])
-    assert np.abs(fixed[one.time < 1.9].mean(axis=0)).max() < 0.2
-    assert 0.3 < np.sqrt(np.mean(fixed[one.time > 4.0] ** 2)) < 3.0
+    recording = hand_held.simulated(1, 0, 10.0)
+    fixed = quaternion.rotate(recording.true_attitude, recording.specific_force) - np.array([0.0, 0.0, 9.81])
+    assert np.abs(fixed[recording.time < 1.9].mean(axis=0)).max() < 0.2
+    assert 0.3 < np.sqrt(np.mean(fixed[recording.time > 4.0] ** 2)) < 3.0
 
 
 def test_a_simulated_hand_is_better_known_by_its_bounded_velocity():
     """On smooth paths that are not the block's own model; the means of four."""
     inclination: dict[str, list[float]] = {"white": [], "coloured": [], "bounded": []}
     for run in range(4):
-        one = hand_held.simulated(1, run, 30.0)
-        inclination["white"].append(errors_by(one, hand_held.QUIET)["inclination"])
-        inclination["coloured"].append(errors_of(*hand_held.coloured(one, 0.0))["inclination"])
-        inclination["bounded"].append(errors_by(one, hand_held.BOUNDED)["inclination"])
-    found = {name: np.mean(values) for name, values in inclination.items()}
-    assert found["bounded"] < 0.95 * found["white"], found
-    assert found["bounded"] < 0.95 * found["coloured"], found
+        recording = hand_held.simulated(1, run, 30.0)
+        inclination["white"].append(errors_by(recording, hand_held.QUIET)["inclination"])
+        inclination["coloured"].append(errors_of(*hand_held.coloured(recording, 0.0))["inclination"])
+        inclination["bounded"].append(errors_by(recording, hand_held.BOUNDED)["inclination"])
+    mean = {name: np.mean(values) for name, values in inclination.items()}
+    assert mean["bounded"] < 0.95 * mean["white"], mean
+    assert mean["bounded"] < 0.95 * mean["coloured"], mean
 
 
 @pytest.mark.slow
@@ -613,36 +619,36 @@ def test_a_gyro_of_wrong_scale_is_better_known_by_states_for_it():
     """The simulated gyro's are 0.3 %; turned in haste here, so that they count; the means of three."""
     total: dict[float, list[float]] = {0.0: [], 2e-3: []}
     for run in range(3):
-        one = hand_held.simulated(2, run, 40.0)
-        for sigma, found in total.items():
+        recording = hand_held.simulated(2, run, 40.0)
+        for sigma, errors in total.items():
             parameters = dataclasses.replace(ahrs.HAND_HELD, gyro_scale_sigma=sigma)
-            found.append(errors_by(one, parameters)["total"])
+            errors.append(errors_by(recording, parameters)["total"])
     assert np.mean(total[2e-3]) < 1.02 * np.mean(total[0.0]), total
 
 
 def test_the_latency_of_a_gyro_beside_a_reference():
     """The reference moved by 4 ms; no filter has part in it."""
-    one = hand_held.simulated(1, 0, 20.0)
-    assert hand_held.gyro_latency(one)[0] == pytest.approx(0.0, abs=1e-4)
-    delayed = hand_held.shifted(one, 0.004)
+    recording = hand_held.simulated(1, 0, 20.0)
+    assert hand_held.gyro_latency(recording)[0] == pytest.approx(0.0, abs=1e-4)
+    delayed = hand_held.shifted(recording, 0.004)
     assert hand_held.gyro_latency(delayed)[0] == pytest.approx(-0.004, abs=2e-4)
 
 
 def errors_over(broad: Path, parameters: ahrs.AhrsParameters, **options) -> np.ndarray:
     """Total error and inclination (n, 2) of each BROAD trial, degrees."""
     errors = (errors_by(read(file), parameters, **options) for file in sorted(broad.glob("*.hdf5")))
-    return np.array([[one["total"], one["inclination"]] for one in errors])
+    return np.array([[trial["total"], trial["inclination"]] for trial in errors])
 
 
 @pytest.mark.slow
 def test_broad_trials_by_bounded_velocity(broad):
     """One set of numbers for all, held against VQF on the same trials (2.6°); at rest the field of trial 27 is 4.6° off."""
-    given = errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
-    assert 1.0 < given[:, 0].mean() < 2.0  # the heading's offset included, which VQF's 2.6° have too
-    assert np.sort(given[:, 0])[:-1].mean() < 1.6
-    assert np.sort(given[:, 0])[-2] < 3.5
-    assert given[:, 0].max() < 6.5  # trial 27, whose hard iron shows in its motion alone
-    assert given[:, 1].mean() < 0.48
+    errors = errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
+    assert 1.0 < errors[:, 0].mean() < 2.0  # the heading's offset included, which VQF's 2.6° have too
+    assert np.sort(errors[:, 0])[:-1].mean() < 1.6
+    assert np.sort(errors[:, 0])[-2] < 3.5
+    assert errors[:, 0].max() < 6.5  # trial 27, whose hard iron shows in its motion alone
+    assert errors[:, 1].mean() < 0.48
     late = [hand_held.gyro_latency(read(file))[0] for file in sorted(broad.glob("*.hdf5"))[::3]]
     np.testing.assert_allclose(late, 4.15e-3, atol=1.5e-4)
 
@@ -650,16 +656,16 @@ def test_broad_trials_by_bounded_velocity(broad):
 def test_a_broad_trial_by_bounded_velocity(broad):
     recording = read(sorted(broad.glob("*.hdf5"))[1])
     np.testing.assert_allclose(hand_held.gyro_latency(recording)[0], 4.15e-3, atol=1.5e-4)
-    found = errors_by(recording, ahrs.HAND_HELD, latency=4.1e-3)
-    assert found["total"] < 0.9
-    assert found["inclination"] < 0.35
+    errors = errors_by(recording, ahrs.HAND_HELD, latency=4.1e-3)
+    assert errors["total"] < 0.9
+    assert errors["inclination"] < 0.35
 
 
 @pytest.mark.slow
 def test_broad_trials_otherwise(broad):
-    hand, given = errors_over(broad, ahrs.HAND_HELD), errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
+    hand, with_latency = errors_over(broad, ahrs.HAND_HELD), errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
     assert hand[:, 1].mean() < 0.7
-    assert given[:, 1].mean() < 0.8 * errors_over(broad, hand_held.QUIET)[:, 1].mean()
+    assert with_latency[:, 1].mean() < 0.8 * errors_over(broad, hand_held.QUIET)[:, 1].mean()
     smoothed = errors_over(broad, ahrs.HAND_HELD_SMOOTHED, latency=4.1e-3, smooth=True)
     assert 1.0 < smoothed[:, 0].max() < 4.5
     assert smoothed[:, 1].mean() < 0.36

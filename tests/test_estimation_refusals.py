@@ -53,9 +53,9 @@ def velocity(**changes):
 
 def block_of(n=1, base=error_states.ErrorStates, **fields):
     """Return a block of another package."""
-    given = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
+    properties = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
     names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    return type("Foreign", (base,), {**names, **given})()
+    return type("Foreign", (base,), {**names, **properties})()
 
 
 def foreign(**fields):
@@ -76,8 +76,8 @@ def run(blocks=(), initial=None, **options):
 
 
 def with_lever(record):
-    chosen = replace(SETUP, states=States(sensors={"force": SensorStates(lever_arm_sigma=0.1)}))
-    return setup.run(record, chosen, start())
+    filter_setup = replace(SETUP, states=States(sensors={"force": SensorStates(lever_arm_sigma=0.1)}))
+    return setup.run(record, filter_setup, start())
 
 
 def uneven():
@@ -91,11 +91,11 @@ def filtered(name="mahony", record=RECORD, process_noise=NOISE, initial=None, **
 
 def measured(**changes):
     """Run both filters over a direction with this noise."""
-    given = {"kind": "direction", "time": [0.1], "vector_b": [X], "reference_f": X}
+    arguments = {"kind": "direction", "time": [0.1], "vector_b": [X], "reference_f": X}
     for run_ in (filters.run, lambda name, *rest: filters.FILTERS[name](*rest)):
         with pytest.raises(InputError):
-            run_("mahony", resting(VectorMeasurements(sensor="sun", **given, **changes)), NOISE, start())
-    filters.run("mekf", resting(VectorMeasurements(sensor="sun", **given, **changes)), NOISE, start())
+            run_("mahony", resting(VectorMeasurements(sensor="sun", **arguments, **changes)), NOISE, start())
+    filters.run("mekf", resting(VectorMeasurements(sensor="sun", **arguments, **changes)), NOISE, start())
 
 
 def predicted(**arguments):
@@ -106,13 +106,13 @@ def predicted(**arguments):
         assert f.time == 1.0
 
 
-def given_live(**given):
+def given_live(**arguments):
     """Give a sample to a live filter, which stays as it was if it refuses it."""
     live = LiveFilter(NOISE, start(), sensors=[SENSOR], look_back=1.0)
     live.update(0.1, (0.0, 0.0, 0.1), up=(0.0, 0.1, 1.0))
     before = live.state()
     try:
-        live.update(**{"time": 0.2, "gyro": (0, 0, 0), **given})
+        live.update(**{"time": 0.2, "gyro": (0, 0, 0), **arguments})
     finally:
         for part in ("attitude", "bias", "covariance"):
             assert np.array_equal(getattr(live.state(), part), getattr(before, part))
@@ -348,10 +348,10 @@ TABLE = [
 ]
 
 
-@pytest.mark.parametrize(("call", "given", "named"), TABLE, ids=[f"{k} {row[2]}" for k, row in enumerate(TABLE)])
-def test_it_is_refused_by_the_name_of_the_argument(call, given, named):
+@pytest.mark.parametrize(("call", "arguments", "named"), TABLE, ids=[f"{k} {row[2]}" for k, row in enumerate(TABLE)])
+def test_it_is_refused_by_the_name_of_the_argument(call, arguments, named):
     with pytest.raises(InputError) as refused:
-        call(**given)
+        call(**arguments)
     assert named in str(refused.value)
     if call in (tabled, tabled_sensor):
         assert "f.toml: filter: states" in str(refused.value)  # and by its place
@@ -360,10 +360,10 @@ def test_it_is_refused_by_the_name_of_the_argument(call, given, named):
 FACES = {
     "estimation.run": estimation.run,
     "estimation.smooth": estimation.smooth,
-    "StepFilter": lambda record, *given: StepFilter(*given),
+    "StepFilter": lambda record, *arguments: StepFilter(*arguments),
     "estimation.observability": estimation.observability,
     "multiple_model.run": lambda record, noise, initial: multiple_model.run(record, noise),
-    "filters.run": lambda *given: filters.run("mahony", *given),
+    "filters.run": lambda *arguments: filters.run("mahony", *arguments),
     "filters.compare": filters.compare,
 }
 WRONG = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}
@@ -379,7 +379,7 @@ def wants(face, name):
 
 @pytest.mark.parametrize(("face", "name"), [(face, name) for face in FACES for name in WRONG if wants(face, name)])
 def test_every_face_refuses_an_argument_of_another_class(face, name):
-    given = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG[name]}
-    three = [given.pop(one) for one in ("record", "process_noise", "initial")]
+    arguments = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG[name]}
+    three = [arguments.pop(argument) for argument in ("record", "process_noise", "initial")]
     with pytest.raises(InputError, match=f"^{name} is {WRONG[name]!r}, not of class {CLASSES[name]}; "):
-        FACES[face](*three, **given)
+        FACES[face](*three, **arguments)

@@ -139,8 +139,8 @@ def test_a_full_disk_is_an_ordinary_error_of_hdf5_too(tmp_path):
 def test_numbers_of_few_digits_are_written_with_them(suffix, factor):
     """Of a thousand decimal numbers some quotients by the factor have 17 digits; those of few digits give the same number."""
     for number in (k / 1000.0 for k in range(1, 1001)):
-        (found,) = tables._entry("angle", number * factor, ((suffix, factor),)).items()
-        assert found == (f"angle_{suffix}", number)
+        (entry,) = tables._entry("angle", number * factor, ((suffix, factor),)).items()
+        assert entry == (f"angle_{suffix}", number)
 
 
 # ---------------------------------------------------------------------------------------------------- links, permissions

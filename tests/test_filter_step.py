@@ -179,14 +179,14 @@ def test_the_simulated_gyros_errors_have_that_covariance():
     body = motion.ConstantRate(rate=(0.0, 0.0, 200.0))
     edges = np.arange(n + 1) * dt
     spec = gyro.GyroSpec(angle_random_walk=sigma)
-    given = gyro.simulate(spec, body.increments(edges), edges, np.random.default_rng(4))
+    output = gyro.simulate(spec, body.increments(edges), edges, np.random.default_rng(4))
     true = quaternion.exp(np.array([0.0, 0.0, 2.0]))
-    error = quaternion.log(quaternion.multiply(quaternion.conjugate(quaternion.exp(given.increments)), true))
-    found = error.T @ error / n / (sigma**2 * dt)
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(quaternion.exp(output.increments)), true))
+    covariance = error.T @ error / n / (sigma**2 * dt)
     spread = math.sqrt(2.0 / n)  # of a variance over itself
     expected = np.array([across(2.0), across(2.0), 1.0])
-    assert np.all(np.abs(np.diag(found) / expected - 1.0) < 4.0 * spread)
-    assert np.all(np.abs(found - np.diag(np.diag(found))) < 4.0 / math.sqrt(n))
+    assert np.all(np.abs(np.diag(covariance) / expected - 1.0) < 4.0 * spread)
+    assert np.all(np.abs(covariance - np.diag(np.diag(covariance))) < 4.0 / math.sqrt(n))
 
 
 @pytest.mark.parametrize("x", [0.1, 0.35, 1.0, 2.0])

@@ -142,14 +142,14 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
     off = 2e-5 * rng.standard_normal(3)
     rows = np.linalg.svd(r_b[None])[2][1:] if kind == "direction" else np.eye(3)
     if kind == "attitude":
-        given = {"attitude": quaternion.multiply(initial.attitude, quaternion.exp(off))[None]}
+        fields = {"attitude": quaternion.multiply(initial.attitude, quaternion.exp(off))[None]}
         H, e = np.eye(3), off
     else:
         z = r_b + off
         z = z if kind == "vector" else z / np.linalg.norm(z)
-        given = {"vector_b": z[None], "reference_f": r}
+        fields = {"vector_b": z[None], "reference_f": r}
         H, e = rows @ kinematics.skew(r_b), rows @ (z - r_b)
-    series = VectorMeasurements(sensor="sun", kind=kind, time=[0.0], sigma=sigma, **given)
+    series = VectorMeasurements(sensor="sun", kind=kind, time=[0.0], sigma=sigma, **fields)
     record = resting(series)
     S = H @ initial.covariance[:3, :3] @ H.T + sigma**2 * np.eye(len(rows))
     nis = filters.run(name, record, BELIEF, initial).innovations["sun"].nis
@@ -196,11 +196,11 @@ def test_own_filters_tend_to_the_mekf_for_small_errors(name):
     noise = estimation.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-9)
     initial = started(record, rng, attitude_sigma=1e-4, bias_sigma=1e-5)
     reference = estimation.run(record, noise, initial, full_covariance=True)
-    found = own_filter(name, noise).run(record, initial)
+    estimate = own_filter(name, noise).run(record, initial)
     sigma = reference.sigma.max(axis=0)
-    assert quaternion.angle_between(found.attitude, reference.attitude).max() < 1e-7
-    assert np.abs((found.bias - reference.bias) / sigma[3:]).max() < 2e-3
-    assert np.abs((found.covariance - reference.covariance) / np.outer(sigma, sigma)).max() < 2e-3
+    assert quaternion.angle_between(estimate.attitude, reference.attitude).max() < 1e-7
+    assert np.abs((estimate.bias - reference.bias) / sigma[3:]).max() < 2e-3
+    assert np.abs((estimate.covariance - reference.covariance) / np.outer(sigma, sigma)).max() < 2e-3
 
 
 @pytest.mark.parametrize("name", filters.FILTERS)
@@ -377,21 +377,21 @@ def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
         value[[k, 5], k % 3] = np.nan
         lost.append(dataclasses.replace(series, **{content: value}))
         fewer.append(series.taken(np.delete(np.arange(6), [k, 5])))
-    one, other = (
+    missing, removed = (
         filters.run(name, dataclasses.replace(record, vectors=tuple(vectors)), BELIEF, initial, full_covariance=True)
         for vectors in (lost, fewer)
     )
-    assert one.skipped == dict.fromkeys(REFERENCES, 2)
-    assert other.skipped == dict.fromkeys(REFERENCES, 0)
-    (gap,) = one.events
+    assert missing.skipped == dict.fromkeys(REFERENCES, 2)
+    assert removed.skipped == dict.fromkeys(REFERENCES, 0)
+    (gap,) = missing.events
     assert (gap.kind, gap.start, gap.end) == ("gap", record.time[12], record.time[13])
     assert gap == estimation.run(record, BELIEF, initial).events[0]
     for part in ("attitude", "bias", "covariance"):
-        np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
-    for sensor, innovations in one.innovations.items():
+        np.testing.assert_array_equal(getattr(missing, part), getattr(removed, part))
+    for sensor, innovations in missing.innovations.items():
         assert len(innovations.time) == 4
-        np.testing.assert_array_equal(innovations.whitened, other.innovations[sensor].whitened)
-    assert_sound(one)
+        np.testing.assert_array_equal(innovations.whitened, removed.innovations[sensor].whitened)
+    assert_sound(missing)
 
 
 @pytest.mark.parametrize(
@@ -580,7 +580,7 @@ def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
     M = derivative(
         lambda d: np.array([turned(q, np.zeros(3))[0] for q in quaternion.multiply(q0, quaternion.exp(-d))]), 3
     )
-    K = derivative(lambda e: np.array([turned(q0, one)[0] for one in e]), 3)
+    K = derivative(lambda e: np.array([turned(q0, error)[0] for error in e]), 3)
     turn, M_reported, V = turned(q0, np.zeros(3))
     np.testing.assert_allclose(turn, 0.0, atol=1e-11)
     np.testing.assert_allclose(np.reshape(M_reported, (3, 3)), M, atol=1e-9)
@@ -692,11 +692,13 @@ def test_propagation_over_any_turn_is_that_of_its_linear_system(angle, name):
     for b in (rng.standard_normal(3), -phi / dt):
         initial = estimation.State(attitude=quaternion.exp(rng.standard_normal(3)), bias=b, covariance=M @ M.T)
         record = ImuRecord(time=[0.0, dt], increments=[phi + b * dt], vectors=())
-        found = filters.run(name, record, noise, initial, full_covariance=True)
-        np.testing.assert_allclose(found.covariance[1], transition @ (M @ M.T) @ transition.T + Q, rtol=0.0, atol=1e-11)
+        estimate = filters.run(name, record, noise, initial, full_covariance=True)
+        np.testing.assert_allclose(
+            estimate.covariance[1], transition @ (M @ M.T) @ transition.T + Q, rtol=0.0, atol=1e-11
+        )
         turned = Rotation.from_quat(initial.attitude, scalar_first=True) * Rotation.from_rotvec(phi)
-        assert (Rotation.from_quat(found.attitude[1], scalar_first=True).inv() * turned).magnitude() < 1e-12
-        np.testing.assert_array_equal(found.bias[1], b)
+        assert (Rotation.from_quat(estimate.attitude[1], scalar_first=True).inv() * turned).magnitude() < 1e-12
+        np.testing.assert_array_equal(estimate.bias[1], b)
 
 
 def test_the_largest_correction_is_where_the_geometric_bias_begins_to_grow():
@@ -763,7 +765,10 @@ def test_every_filter_stays_finite_from_any_start(name, many):
 
 @pytest.mark.parametrize(
     ("kind", "form"),
-    [pytest.param(*one, marks=pytest.mark.slow if one[1] == "axes" and one[0] != "attitude" else []) for one in CASES],
+    [
+        pytest.param(*case, marks=pytest.mark.slow if case[1] == "axes" and case[0] != "attitude" else [])
+        for case in CASES
+    ],
 )
 def test_every_filter_stays_finite_whatever_it_measures(kind, form):
     rng = np.random.default_rng([48, CASES.index((kind, form))])

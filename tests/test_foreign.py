@@ -73,7 +73,9 @@ def fixed_side(estimate):
 
 
 def statistics(judgement):
-    return [(one.name, one.of, one.value, one.p_value, one.rejected) for one in judgement.findings]
+    return [
+        (finding.name, finding.of, finding.value, finding.p_value, finding.rejected) for finding in judgement.findings
+    ]
 
 
 # ---------------------------------------------------------------------------------------------------------- our own
@@ -81,13 +83,13 @@ def statistics(judgement):
 
 def test_our_own_estimate_gets_its_own_verdict(run):
     own = consistency.judge(run.estimate, run.record.truth)
-    found = checked(run)
+    outcome = checked(run)
     assert own.verdict == "cannot tell"  # of the bias, which hardly changes in one run
-    assert statistics(found.judgement) == statistics(own)
-    assert found.alignment.estimated == ()
-    assert found.error_frame == "body"
-    assert found.frame_probability["body"] > 0.99
-    assert not any(one.likely for one in found.explanations)
+    assert statistics(outcome.judgement) == statistics(own)
+    assert outcome.alignment.estimated == ()
+    assert outcome.error_frame == "body"
+    assert outcome.frame_probability["body"] > 0.99
+    assert not any(explanation.likely for explanation in outcome.explanations)
 
 
 @pytest.mark.parametrize(("m", "factor", "likely"), [(400, 1.0, False), (400, 1.3, True), (10, 1.3, False)])
@@ -101,11 +103,11 @@ def test_a_factor_on_sigma_is_likely_where_it_shows(m, factor, likely):
     known = foreign.explanations(
         1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude)
     )
-    (found,) = (one for one in known if one.name == foreign.SCALE)
-    assert float(found.value) == pytest.approx(factor, rel=1e-3)
-    assert found.likely == likely
-    assert (found.p_value > 0.5) == (not likely)
-    assert not any(one.likely for one in known if one.name != foreign.SCALE)
+    (scale,) = (explanation for explanation in known if explanation.name == foreign.SCALE)
+    assert float(scale.value) == pytest.approx(factor, rel=1e-3)
+    assert scale.likely == likely
+    assert (scale.p_value > 0.5) == (not likely)
+    assert not any(explanation.likely for explanation in known if explanation.name != foreign.SCALE)
 
 
 def correlated(draw, memory, m=600):
@@ -128,8 +130,10 @@ def test_of_right_filters_one_in_a_hundred_is_given_a_cause(memory):
         attitude, true = correlated(draw, memory)
         error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), true))
         truth = Truth.of_reference(true)
-        found = foreign.explanations(error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude))
-        blamed += any(one.likely for one in found)
+        explanations = foreign.explanations(
+            error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude)
+        )
+        blamed += any(explanation.likely for explanation in explanations)
     assert blamed <= 4
 
 
@@ -138,15 +142,15 @@ def test_a_rotation_of_two_sigma_is_a_likely_cause():
     attitude, truth = correlated(draw, 5.0)
     time, P = np.arange(600.0), np.tile(1e-6 * np.eye(3), (600, 1, 1))
     turned = quaternion.multiply(quaternion.exp([0.0, 0.0, 2e-3]), attitude)
-    found = check_arrays(time, turned, P, time, truth, align="none").explanations[0]
-    assert found.likely
-    assert found.name.startswith("constant rotation of the fixed frame")
+    explanation = check_arrays(time, turned, P, time, truth, align="none").explanations[0]
+    assert explanation.likely
+    assert explanation.name.startswith("constant rotation of the fixed frame")
 
 
 def test_a_bias_held_at_zero_is_named(run):
     m = len(run.estimate.time)
     true = replace(run.record.truth, bias=run.record.truth.bias + 1e-3)
-    found = check_arrays(
+    outcome = check_arrays(
         run.estimate.time,
         run.estimate.attitude,
         run.estimate.covariance,
@@ -155,9 +159,9 @@ def test_a_bias_held_at_zero_is_named(run):
         bias=np.zeros((m, 3)),
         true_bias=true.bias,
     )
-    (one,) = (one for one in found.explanations if one.name == foreign.NO_BIAS)
-    assert one.likely
-    assert one.value == f"{np.sqrt(np.mean(np.sum(true.bias**2, axis=1))) / DEGREE * 3600.0:.3g} °/h"
+    (no_bias,) = (explanation for explanation in outcome.explanations if explanation.name == foreign.NO_BIAS)
+    assert no_bias.likely
+    assert no_bias.value == f"{np.sqrt(np.mean(np.sum(true.bias**2, axis=1))) / DEGREE * 3600.0:.3g} °/h"
 
 
 def command(monkeypatch, capsys, *arguments):
@@ -199,9 +203,11 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
     )
     assert saved["headline"] == own.headline
     assert status == {"consistent": 0, "cannot tell": 3}[own.verdict]
-    assert [(one["name"], one["of"]) for one in saved["findings"]] == [(one.name, one.of) for one in own.findings]
+    assert [(finding["name"], finding["of"]) for finding in saved["findings"]] == [
+        (finding.name, finding.of) for finding in own.findings
+    ]
     np.testing.assert_allclose(
-        [one["value"] for one in saved["findings"]], [one.value for one in own.findings], rtol=1e-9
+        [finding["value"] for finding in saved["findings"]], [finding.value for finding in own.findings], rtol=1e-9
     )
     assert saved["alignment"]["removed"] == []
     assert "the file declares that its covariance is of the body error" in said
@@ -216,10 +222,10 @@ def test_the_reference_of_a_broad_trial_is_a_truth(tmp_path):
         ),
         tmp_path / "trial.hdf5",
     )
-    found = read_attitudes(tmp_path / "trial.hdf5")
-    assert len(found.stamps_ns) == 48
-    assert found.stamps_ns[7] == 90_000_000
-    np.testing.assert_allclose(found.attitude, attitude[np.isfinite(attitude[:, 0])], atol=1e-15)
+    reference = read_attitudes(tmp_path / "trial.hdf5")
+    assert len(reference.stamps_ns) == 48
+    assert reference.stamps_ns[7] == 90_000_000
+    np.testing.assert_allclose(reference.attitude, attitude[np.isfinite(attitude[:, 0])], atol=1e-15)
     recordings.write(
         recordings.Recording(source="bare", time=np.arange(50) / 100.0, rate=np.zeros((50, 3))), tmp_path / "bare.hdf5"
     )
@@ -248,7 +254,7 @@ def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys
     )  # fmt: skip
     assert (saved["verdict"], status) == (alone.verdict, {"consistent": 0, "cannot tell": 3}[alone.verdict])
     np.testing.assert_allclose(
-        [one["value"] for one in saved["findings"]], [one.value for one in alone.findings], rtol=1e-6
+        [finding["value"] for finding in saved["findings"]], [finding.value for finding in alone.findings], rtol=1e-6
     )
 
 
@@ -279,18 +285,18 @@ def test_what_was_judged_can_be_reported(suffix, verdict, files, run, monkeypatc
 
 def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):
     e = run.estimate
-    found = checked(run, covariance=e.covariance[:, :3, :3], bias=None, innovations={})
+    outcome = checked(run, covariance=e.covariance[:, :3, :3], bias=None, innovations={})
     out = tmp_path / "attitude.h5"
-    setup.write_estimate(out, found.estimate)
+    setup.write_estimate(out, outcome.estimate)
     read = setup.read_estimate(out)
     assert not read.has_bias
     np.testing.assert_array_equal(read.covariance[:, :3, :3], e.covariance[:, :3, :3])
-    assert statistics(consistency.judge(read)) == statistics(found.judgement)
-    assert {one.of for one in found.judgement.findings} == {"attitude"}
+    assert statistics(consistency.judge(read)) == statistics(outcome.judgement)
+    assert {finding.of for finding in outcome.judgement.findings} == {"attitude"}
     report.write(out, tmp_path / "attitude.html")
     page = (tmp_path / "attitude.html").read_text(encoding="utf-8")
     assert "gyro bias" not in page
-    assert all("NaN" not in one.read_text() for one in tmp_path.glob("*.json"))
+    assert all("NaN" not in file.read_text() for file in tmp_path.glob("*.json"))
 
 
 # ------------------------------------------------------------------------------------------------------- faults, named
@@ -318,13 +324,15 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_broken_filter_is_called_wrong_and_its_fault_is_named_first(run, fault):
     changes, name, size = FAULTS[fault]
-    made = {key: value(run.estimate) if callable(value) else value for key, value in changes.items()}
-    found = checked(run, **{"error_frame": "body", "innovations": {}, **made})
-    assert found.judgement.verdict == "not consistent"
-    assert found.explanations[0].name == name, [(one.name, one.p_value, one.nees) for one in found.explanations]
-    assert found.explanations[0].likely
-    assert abs(np.log(found.explanations[0].nees)) < np.log(1.5)
-    numbers = [float(number) for number in re.findall(r"[-+.\de]+(?=[,° ]|$)", found.explanations[0].value)]
+    arguments = {key: value(run.estimate) if callable(value) else value for key, value in changes.items()}
+    outcome = checked(run, **{"error_frame": "body", "innovations": {}, **arguments})
+    assert outcome.judgement.verdict == "not consistent"
+    assert outcome.explanations[0].name == name, [
+        (explanation.name, explanation.p_value, explanation.nees) for explanation in outcome.explanations
+    ]
+    assert outcome.explanations[0].likely
+    assert abs(np.log(outcome.explanations[0].nees)) < np.log(1.5)
+    numbers = [float(number) for number in re.findall(r"[-+.\de]+(?=[,° ]|$)", outcome.explanations[0].value)]
     np.testing.assert_allclose(numbers, size, rtol=0.1, atol=0.1)
 
 
@@ -335,20 +343,20 @@ def test_the_reading_of_the_covariance_is_found(run):
     e = run.estimate
     turn = np.linalg.inv(euler_axes(e.attitude)[:, :, ::-1])
     for frame, P in (("fixed", fixed_side(e)), ("euler", carried(e.covariance, turn))):
-        found = checked(run, covariance=P)
-        assert found.error_frame == frame
-        assert found.frame_probability[frame] > 0.99
-        np.testing.assert_allclose(found.estimate.covariance, e.covariance, atol=1e-9 * e.covariance.max())
+        outcome = checked(run, covariance=P)
+        assert outcome.error_frame == frame
+        assert outcome.frame_probability[frame] > 0.99
+        np.testing.assert_allclose(outcome.estimate.covariance, e.covariance, atol=1e-9 * e.covariance.max())
     wrong = checked(run, covariance=fixed_side(e), error_frame="body")
     assert any("the errors fit far better read as fixed" in words for words in wrong.remarks)
 
 
 def test_equal_axes_leave_the_reading_open(run):
     m = len(run.estimate.time)
-    found = checked(run, covariance=np.tile(DEGREE**2 * np.eye(3), (m, 1, 1)), bias=None)
-    assert found.frame_probability["body"] == pytest.approx(found.frame_probability["fixed"], rel=1e-6)
-    assert any("do not decide how the covariance is defined" in words for words in found.remarks)
-    assert found.error_frame == "body"
+    outcome = checked(run, covariance=np.tile(DEGREE**2 * np.eye(3), (m, 1, 1)), bias=None)
+    assert outcome.frame_probability["body"] == pytest.approx(outcome.frame_probability["fixed"], rel=1e-6)
+    assert any("do not decide how the covariance is defined" in words for words in outcome.remarks)
+    assert outcome.error_frame == "body"
 
 
 def test_euler_axes_are_the_derivative_of_the_angles():
@@ -369,22 +377,22 @@ def test_frames_and_clock_are_found_and_removed(run):
     e = run.estimate
     turned = quaternion.multiply(quaternion.multiply(F, e.attitude), B)
     T = np.kron(np.eye(2), quaternion.to_matrix(quaternion.conjugate(B)))
-    found = checked(
+    outcome = checked(
         run, time=e.time + 1e6, attitude=turned, covariance=T @ e.covariance @ T.T, bias=e.bias @ T[:3, :3].T
     )
-    a = found.alignment
+    a = outcome.alignment
     assert a.estimated == ("time", "fixed", "body")
-    for rotation, made, rows in ((a.fixed, F, slice(0, 3)), (a.body, B, slice(3, 6))):
-        off = quaternion.log(quaternion.multiply(quaternion.exp(rotation), made))
+    for rotation, applied, rows in ((a.fixed, F, slice(0, 3)), (a.body, B, slice(3, 6))):
+        off = quaternion.log(quaternion.multiply(quaternion.exp(rotation), applied))
         assert np.all(np.abs(off) < 4.5 * a.sigma[rows])
         assert np.all(a.sigma[rows] < 0.5 * DEGREE)
     assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
-    assert found.judgement.verdict != "not consistent"
-    assert len([words for words in found.remarks if "removed" in words]) == 3
+    assert outcome.judgement.verdict != "not consistent"
+    assert len([words for words in outcome.remarks if "removed" in words]) == 3
     # In the truth's body axes again, but for the uncertainty of what was removed, which is part of the covariance.
-    rows = np.searchsorted(e.time, found.estimate.time - 0.05)
-    np.testing.assert_allclose(found.estimate.bias, e.bias[rows], atol=0.03 * np.abs(e.bias).max())
-    added = found.estimate.covariance[:, :3, :3] - e.covariance[rows, :3, :3]
+    rows = np.searchsorted(e.time, outcome.estimate.time - 0.05)
+    np.testing.assert_allclose(outcome.estimate.bias, e.bias[rows], atol=0.03 * np.abs(e.bias).max())
+    added = outcome.estimate.covariance[:, :3, :3] - e.covariance[rows, :3, :3]
     assert np.linalg.eigvalsh(added).min() > 0.0
     assert np.trace(added.mean(axis=0)) > 3.0 * float(np.mean(a.sigma[:6] ** 2))
 
@@ -394,15 +402,15 @@ def test_conventions_of_quaternions_are_found(run, convention):
     q = run.estimate.attitude
     q = quaternion.conjugate(q) if "conjugate" in convention else q
     q = q[:, [1, 2, 3, 0]] if "last" in convention else q
-    found = checked(run, attitude=q)
-    assert found.judgement.verdict != "not consistent"
-    assert found.alignment.estimated == ()
+    outcome = checked(run, attitude=q)
+    assert outcome.judgement.verdict != "not consistent"
+    assert outcome.alignment.estimated == ()
     wanted = {
         "conjugate": "the inverse, fixed",
         "last": "read as scalar last,",
         "last, conjugate": "scalar last and the inverse",
     }
-    assert any(wanted[convention] in words for words in found.remarks)
+    assert any(wanted[convention] in words for words in outcome.remarks)
 
 
 def test_sigma_of_the_alignment_is_honest():
@@ -425,9 +433,9 @@ def test_sigma_of_the_alignment_is_honest():
 def test_a_sparser_truth_is_taken_at_its_own_times(run):
     t = run.record.truth
     every = slice(3, None, 20)
-    found = checked(run, true_time=run.estimate.time[every], true_attitude=t.attitude[every], true_bias=t.bias[every])
-    assert len(found.estimate.time) == len(run.estimate.time[every])
-    np.testing.assert_allclose(found.estimate.attitude, run.estimate.attitude[every], atol=1e-12)
+    outcome = checked(run, true_time=run.estimate.time[every], true_attitude=t.attitude[every], true_bias=t.bias[every])
+    assert len(outcome.estimate.time) == len(run.estimate.time[every])
+    np.testing.assert_allclose(outcome.estimate.attitude, run.estimate.attitude[every], atol=1e-12)
     for before in (0.03, -0.03):  # between the estimate's times: its covariance is that of the nearest
         off = {"true_time": run.estimate.time[every] + before, "align": "none", "error_frame": "body"}
         off |= {"true_attitude": FLIGHT.motion.attitude(off["true_time"]), "true_bias": t.bias[every]}
@@ -436,9 +444,9 @@ def test_a_sparser_truth_is_taken_at_its_own_times(run):
 
 def test_what_is_asked_for_is_removed(run):
     turned = quaternion.multiply(HEADING, run.estimate.attitude)
-    found = checked(run, attitude=turned, align="fixed", error_frame="body")
-    assert found.alignment.estimated == ("fixed",)
-    assert found.judgement.verdict != "not consistent"
+    outcome = checked(run, attitude=turned, align="fixed", error_frame="body")
+    assert outcome.alignment.estimated == ("fixed",)
+    assert outcome.judgement.verdict != "not consistent"
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
@@ -570,7 +578,7 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
     twist = t["geometry_msgs/msg/TwistWithCovariance"](
         twist=t["geometry_msgs/msg/Twist"](linear=zero, angular=zero), covariance=np.zeros(36)
     )
-    made = {
+    makers = {
         "nav_msgs/msg/Odometry": lambda k: t["nav_msgs/msg/Odometry"](
             header=header(k), child_frame_id="base_link", pose=pose(k), twist=twist
         ),
@@ -581,7 +589,7 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
     }
     folder = tmp_path / "bag"
     with rosbag2.Writer(folder, version=9) as writer:
-        for kind, make in made.items():
+        for kind, make in makers.items():
             connection = writer.add_connection(f"/{kind.rpartition('/')[2].lower()}", kind, typestore=store)
             for k in range(30):
                 writer.write(connection, k, store.serialize_cdr(make(k), kind))
@@ -592,7 +600,7 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         np.testing.assert_allclose(read.attitude, e.attitude[:number], atol=1e-12)
         np.testing.assert_array_equal(read.covariance, np.tile(P[3:, 3:], (number, 1, 1)))
         assert read.stamps_ns[1] - read.stamps_ns[0] == 10**8
-    storage = next(one for one in folder.iterdir() if one.suffix != ".yaml")
+    storage = next(file for file in folder.iterdir() if file.suffix != ".yaml")
     storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
     half = read_attitudes(folder, topic="/odometry")
     assert any("only its" in words and "complete messages are read" in words for words in half.remarks)
@@ -641,9 +649,11 @@ def test_tables_of_covariances_in_degrees_are_read(tmp_path):
 def test_a_repeated_innovation_of_a_flight_log_is_no_measurement():
     stamps = np.array([5, 6, 7, 8]) * 100_000
     values = {"timestamp": stamps, "heading": np.array([0.1, 0.1, 0.2, 0.2])}
-    found = attitudes._ulog_innovations(values, {"timestamp": stamps, "heading": np.full(4, 4.0)}, 500_000)["heading"]
-    np.testing.assert_allclose(found.time, [0.0, 0.2])
-    np.testing.assert_array_equal(found.innovation[:, 0], [0.1, 0.2])
+    innovations = attitudes._ulog_innovations(values, {"timestamp": stamps, "heading": np.full(4, 4.0)}, 500_000)[
+        "heading"
+    ]
+    np.testing.assert_allclose(innovations.time, [0.0, 0.2])
+    np.testing.assert_array_equal(innovations.innovation[:, 0], [0.1, 0.2])
 
 
 def test_the_command_refuses(files, monkeypatch, capsys):
@@ -743,13 +753,13 @@ def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
     """Over 40 runs; the errors are on the body side, as smsfusion's source says."""
     for package in ("smsfusion", "attipy", "gtsam"):
         pytest.importorskip(package)
-    found = peer_judged.main(runs=40, duration=40.0)
+    study = peer_judged.main(runs=40, duration=40.0)
     for right in ("AttiPy, heading's derivative mended", "GTSAM"):
-        assert found.judgements[right].verdict != "not consistent"
+        assert study.judgements[right].verdict != "not consistent"
     for wrong in ("smsfusion, noises of another sensor", "GTSAM, gyro with a bias"):
-        assert found.judgements[wrong].words.startswith("not consistent: the filter is optimistic")
-    assert found.judgements["smsfusion, covariance read as fixed"].verdict == "not consistent"
-    assert found.frame_probability["body"] > 0.99
+        assert study.judgements[wrong].words.startswith("not consistent: the filter is optimistic")
+    assert study.judgements["smsfusion, covariance read as fixed"].verdict == "not consistent"
+    assert study.frame_probability["body"] > 0.99
 
 
 def test_the_heading_gradient_of_the_sim_is_the_derivative():

@@ -126,10 +126,10 @@ def test_tune():
     record = sd.simulate(true)
     start = dataclasses.replace(sd.FilterSetup.for_scenario(true, states=False), sigma={"star 1": 5e-4, "star 2": 1e-4})
     tuned = sd.tune(record, setup=start, free=["star 1.sigma"], starts=1, threads=1)
-    found = tuned["star 1.sigma"]
-    assert found.lower < 1e-4 < found.upper
-    assert abs(found.value / 1e-4 - 1.0) < 0.15
-    assert tuned.setup.sigma["star 1"] == pytest.approx(found.value)
+    parameter = tuned["star 1.sigma"]
+    assert parameter.lower < 1e-4 < parameter.upper
+    assert abs(parameter.value / 1e-4 - 1.0) < 0.15
+    assert tuned.setup.sigma["star 1"] == pytest.approx(parameter.value)
     assert len(sd.estimate(record, setup=tuned.setup).time) == len(record.time)
 
 
@@ -160,8 +160,8 @@ def test_monte_carlo_verdict():
 )
 def test_estimate_of_a_record_is_that_of_the_command(succeeds, tmp_path, options, keywords):
     errors = {"scale_factor": (3e-4, 0.0, 0.0), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
-    made = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
-    sd.write(sd.simulate(made, seed=9), tmp_path / "record.h5")
+    with_errors = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
+    sd.write(sd.simulate(with_errors, seed=9), tmp_path / "record.h5")
     succeeds("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
     command = sd.read(tmp_path / "out" / "estimate.h5")
     estimator = sd.smooth if "--smooth" in options else sd.estimate
@@ -202,23 +202,23 @@ def test_a_replayed_run_is_a_record_like_any_other(tmp_path, machine):
     plan = sd.montecarlo.Plan(
         scenario=scenario(10.0), setup=sd.FilterSetup.for_scenario(scenario(10.0), states=False), seed=5, epochs=10
     )
-    found = sd.montecarlo.replay(plan, 2, machine=machine)
-    sd.write(found.record, tmp_path / "run.h5")
+    replayed = sd.montecarlo.replay(plan, 2, machine=machine)
+    sd.write(replayed.record, tmp_path / "run.h5")
     origin = sd.read(tmp_path / "run.h5").origin
     assert (origin.scenario, origin.seed, origin.run) == (scenario(10.0), 5, 2)
-    assert len(sd.estimate(found.record).time) == len(found.record.time)
+    assert len(sd.estimate(replayed.record).time) == len(replayed.record.time)
 
 
 def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_path):
     class Own(sd.motion.ConstantRate):
         pass
 
-    made = dataclasses.replace(scenario(5.0), motion=Own(rate=(0.0, 0.0, 0.1)))
-    record = sd.simulate(made)
+    own = dataclasses.replace(scenario(5.0), motion=Own(rate=(0.0, 0.0, 0.1)))
+    record = sd.simulate(own)
     sd.write(record, tmp_path / "own.h5")
     again = sd.read(tmp_path / "own.h5")
     assert again.origin.scenario is None
-    assert again.origin.gyro == made.gyro
+    assert again.origin.gyro == own.gyro
     np.testing.assert_array_equal(sd.estimate(again).attitude, sd.estimate(record).attitude)
 
 
@@ -226,10 +226,10 @@ def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_pa
 def test_states_are_those_of_the_scenarios_sensors_too():
     faults = sd.vectors.Faults(correlated_sigma=1e-4, correlation_time=20.0)
     first, second = scenario(20.0).sensors
-    made = dataclasses.replace(scenario(20.0), sensors=(dataclasses.replace(first, faults=faults), second))
-    assert list(sd.estimate(sd.simulate(made), states=True).error_states) == ["star 1 disturbance"]
-    assert list(sd.estimate(sd.simulate(made)).error_states) == ["star 1 disturbance"]  # as the error is specified
-    assert not sd.estimate(sd.simulate(made), states=False).error_states
+    disturbed = dataclasses.replace(scenario(20.0), sensors=(dataclasses.replace(first, faults=faults), second))
+    assert list(sd.estimate(sd.simulate(disturbed), states=True).error_states) == ["star 1 disturbance"]
+    assert list(sd.estimate(sd.simulate(disturbed)).error_states) == ["star 1 disturbance"]  # as the error is specified
+    assert not sd.estimate(sd.simulate(disturbed), states=False).error_states
 
 
 def test_a_cut_record_is_still_matched():
@@ -245,14 +245,14 @@ def test_a_cut_record_is_still_matched():
 
 
 def test_own_data_with_own_noise():
-    made = sd.simulate(scenario())
-    own = sd.records.ImuRecord(time=made.time, increments=made.increments, vectors=made.vectors)
+    simulated = sd.simulate(scenario())
+    own = sd.records.ImuRecord(time=simulated.time, increments=simulated.increments, vectors=simulated.vectors)
     with pytest.raises(sd.InputError, match="noise="):
         sd.estimate(own)
     noise = sd.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-7)
     with pytest.raises(sd.InputError, match="initial="):
         sd.estimate(own, noise=noise)
-    start = sd.initial_state(made.truth.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-5)
+    start = sd.initial_state(simulated.truth.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-5)
     estimate = sd.estimate(own, noise=noise, initial=start)
     direct = sd.estimation.run(own, noise, start, full_covariance=True)
     np.testing.assert_array_equal(estimate.attitude, direct.attitude)
@@ -352,7 +352,7 @@ def test_an_inverted_accelerometer_is_warned_of():
 
 
 def test_covariance_analysis_is_that_of_the_matched_filter():
-    found = sd.covariance_analysis(scenario(20.0), epochs=10)
+    analysis = sd.covariance_analysis(scenario(20.0), epochs=10)
     estimate = sd.estimate(
         sd.simulate(scenario(20.0)),
         initial=sd.estimation.setup.initial_state(
@@ -360,7 +360,7 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
         ),
     )
     # Linear about the truth there and about the estimate here, which lie some σ of 1e-4 rad apart.
-    off = (found.filter_covariance[-1] - estimate.covariance[-1]) / np.outer(estimate.sigma[-1], estimate.sigma[-1])
+    off = (analysis.filter_covariance[-1] - estimate.covariance[-1]) / np.outer(estimate.sigma[-1], estimate.sigma[-1])
     assert 0.0 < np.abs(off).max() < 1e-3
 
 
@@ -368,8 +368,8 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
 
 
 def test_a_listing_is_aligned_text_and_escaped_html():
-    made = results.Table("A < B", ("state", "", "σ"), [("x", "rad", 1.5), ("long name", "", 12)], ["a note"], left=2)
-    assert made.text.splitlines() == [
+    table = results.Table("A < B", ("state", "", "σ"), [("x", "rad", 1.5), ("long name", "", 12)], ["a note"], left=2)
+    assert table.text.splitlines() == [
         "A < B",
         "state             σ",
         "-------------------",
@@ -377,7 +377,7 @@ def test_a_listing_is_aligned_text_and_escaped_html():
         "long name        12",
         "a note",
     ]
-    html = xml.etree.ElementTree.fromstring(made.html)
+    html = xml.etree.ElementTree.fromstring(table.html)
     assert html.find("p/b").text == "A < B"
     assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "long name", None, "12"]
     assert [row.get("style") for row in html.iter("th")] == ["text-align:left"] * 2 + ["text-align:right"]
@@ -428,16 +428,16 @@ def test_results_print_as_short_tables():
         sd.fit_noise(samples, 0.01),
         sd.tune(record, free=["star 1.sigma"], starts=1, threads=1),
     ]
-    for one in results:
-        lines = str(one).splitlines()
-        assert 3 < len(lines) < 30, one
-        assert repr(one) == str(one)
-        assert max(map(len, lines)) < 140, one
-        rows = xml.etree.ElementTree.fromstring(one._repr_html_())
+    for result in results:
+        lines = str(result).splitlines()
+        assert 3 < len(lines) < 30, result
+        assert repr(result) == str(result)
+        assert max(map(len, lines)) < 140, result
+        rows = xml.etree.ElementTree.fromstring(result._repr_html_())
         widths = {len(row) for row in rows.iter("tr")}
         assert len(widths) == 1
         images = [image.get("src") for image in rows.iter("img")]
-        assert len(images) == (type(one).__name__ in ("Estimate", "Statistics", "Analysis")), one
+        assert len(images) == (type(result).__name__ in ("Estimate", "Statistics", "Analysis")), result
         for image in images:
             pixels = matplotlib.image.imread(io.BytesIO(base64.b64decode(image.partition(",")[2])))
             assert pixels.shape[1] > 500
@@ -476,11 +476,11 @@ def test_every_public_module_says_what_is_public_and_it_is_not_much():
     for name in (*sorted(set(dir(sd)) - NAMES), *BELOW):
         module = importlib.import_module(f"strapdown.{name}")
         assert module.__all__, name
-        for one in module.__all__:
-            value = getattr(module, one)
-            assert not isinstance(value, types.ModuleType), f"{name}.{one}"
-            if value is not getattr(sd, one, None):  # what the front door shows too is one name
-                public.add(f"strapdown.{name}.{one}")
+        for public_name in module.__all__:
+            value = getattr(module, public_name)
+            assert not isinstance(value, types.ModuleType), f"{name}.{public_name}"
+            if value is not getattr(sd, public_name, None):  # what the front door shows too is one name
+                public.add(f"strapdown.{name}.{public_name}")
     assert 200 < len(public) <= 250, len(public)
 
 
@@ -488,14 +488,14 @@ def test_type_checkers_see_what_is_there():
     """The imports for type checkers name each public name, from the module that it is loaded from."""
     tree = ast.parse(Path(sd.__file__).read_text(encoding="utf-8"))
     (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    seen = {
+    homes = {
         alias.name: node.module.removeprefix("strapdown").removeprefix(".")
         for node in block.body
         if isinstance(node, ast.ImportFrom) and node.module != "typing"
         for alias in node.names
     }
-    assert set(seen) == set(dir(sd))
-    assert {name: home for name, home in seen.items() if home} == sd._HOMES
+    assert set(homes) == set(dir(sd))
+    assert {name: home for name, home in homes.items() if home} == sd._HOMES
 
 
 def python(*arguments, **options):

@@ -114,26 +114,26 @@ def _still(seed, slope, T, dt, white, sensor):
     middle = 0.5 * (T[1:] + T[:-1])
     turns = slope * (middle - T[0])[:, None] * dt + white * np.sqrt(dt) * random.standard_normal((n, 3))
     at = time[10::10]
-    seen = sensor * random.standard_normal((len(at), 3))
+    angles = sensor * random.standard_normal((len(at), 3))
     series = VectorMeasurements(
         sensor="tracker",
         kind="attitude",
         time=at,
-        attitude=sd.quaternion.exp(seen),
+        attitude=sd.quaternion.exp(angles),
         sigma_axes=np.full((len(at), 3), sensor),
     )
-    return records.ImuRecord(time=time, increments=turns, vectors=(series,), temperature=T), seen
+    return records.ImuRecord(time=time, increments=turns, vectors=(series,), temperature=T), angles
 
 
 def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_every_sample():
     """The oracle: one axis at rest, states (θ, b, c), ``θ' = θ − (b + c (T − T₀)) dt`` in each sample, T up and down again."""
     n, dt, white, walk, sensor, prior = 6000, 0.05, 1e-5, 1e-7, 1e-3, 5e-4
     T = 25.0 + 8.0 * np.sin(np.linspace(0.0, 5.0, n + 1))
-    record, seen = _still(1, np.array([3e-4, -2e-4, 0.0]), T, dt, white, sensor)
+    record, angles = _still(1, np.array([3e-4, -2e-4, 0.0]), T, dt, white, sensor)
     start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.01, bias_sigma=1e-3)
     noise = estimation.ProcessNoise(angle_random_walk=white, rate_random_walk=walk)
     block = error_states.GyroTemperature(slope_sigma=prior)
-    found = estimation.run(record, noise, start, (block,), every=10)
+    estimate = estimation.run(record, noise, start, (block,), every=10)
     middle = 0.5 * (T[1:] + T[:-1]) - T[0]
     H = np.array([1.0, 0.0, 0.0])
     for axis in range(3):
@@ -151,16 +151,18 @@ def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_ever
             P = F @ P @ F.T + Q
             if (k + 1) % 10 == 0:
                 K = P @ H / (P[0, 0] + sensor**2)
-                x, P = x + K * (seen[(k + 1) // 10 - 1, axis] - x[0]), P - np.outer(K, H @ P)
+                x, P = x + K * (angles[(k + 1) // 10 - 1, axis] - x[0]), P - np.outer(K, H @ P)
                 J = np.array([1.0, T[k + 1] - T[0]])
                 rows.append(np.array([x[0], x[1] + x[2] * J[1], x[2]]))
                 spreads.append(np.array([P[0, 0], J @ P[1:, 1:] @ J, P[2, 2]]))
         expected, sigma = np.array(rows)[1:], np.sqrt(np.array(spreads))[1:]
-        slopes = found.error_states["gyro temperature"]
-        ours = np.stack([found.rotation.as_rotvec()[:, axis], found.bias[:, axis], slopes.values[:, axis]], axis=1)[1:]
+        slopes = estimate.error_states["gyro temperature"]
+        ours = np.stack(
+            [estimate.rotation.as_rotvec()[:, axis], estimate.bias[:, axis], slopes.values[:, axis]], axis=1
+        )[1:]
         # The axes turn into each other by the error's own size.
         assert np.abs((ours - expected) / sigma)[20:].max() < 0.1
-        spread = np.stack([found.sigma[:, axis], found.sigma[:, 3 + axis], slopes.sigma[:, axis]], axis=1)[1:]
+        spread = np.stack([estimate.sigma[:, axis], estimate.sigma[:, 3 + axis], slopes.sigma[:, axis]], axis=1)[1:]
         assert np.abs(spread / sigma - 1.0)[100:].max() < 0.05  # the σ is that at the mean temperature of the stretch
     assert len(list(driven.stretches(record, 10))) > driven.LEVELS
 
@@ -224,18 +226,18 @@ def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not
     noise = estimation.ProcessNoise(
         angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=3.0 * DEGREE_PER_HOUR / 60.0
     )
-    chosen = setup.FilterSetup(
+    filter_setup = setup.FilterSetup(
         process_noise=noise, attitude_sigma=1e-3, bias_sigma=50.0 * DEGREE_PER_HOUR, states=states
     )
     nees = {True: [], False: []}
     for run in range(runs):
         record = scenarios.simulate(scenarios.drawn(scenario, 7, run), 7, run)
-        start, truth = drawn_start(record, chosen).state, record.truth
+        start, truth = drawn_start(record, filter_setup).state, record.truth
         for driven_too, values in nees.items():
-            used = chosen if driven_too else replace(chosen, states=None)
-            found = setup.run(record, used, start, every=50, full_covariance=True)
-            error = consistency.errors(found.attitude, found.bias, truth.attitude[::50], truth.bias[::50])
-            values.append(consistency.nees(error, found.covariance)[[20, 60, -1]])
+            used = filter_setup if driven_too else replace(filter_setup, states=None)
+            estimate = setup.run(record, used, start, every=50, full_covariance=True)
+            error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::50], truth.bias[::50])
+            values.append(consistency.nees(error, estimate.covariance)[[20, 60, -1]])
     low, high = chi2.ppf([0.0005, 0.9995], runs * 6) / (runs * 6)
     anees = np.mean(nees[True], axis=0) / 6.0
     assert (low < anees).all()
@@ -263,8 +265,8 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     bent = replace(warm, coefficients=np.array([[0.0] * 3, [0.0] * 3, [1e-6] * 3]), sigma=np.zeros((3, 3)))
     course = scenarios.Temperature(start=20.0, end=40.0)
     curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
-    found = setup.FilterSetup.for_scenario(curved, states=True).states.gyro_temperature_sigma
-    np.testing.assert_allclose(found, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
+    sigma = setup.FilterSetup.for_scenario(curved, states=True).states.gyro_temperature_sigma
+    np.testing.assert_allclose(sigma, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
     plan = montecarlo.Plan(scenario=linear, setup=setup.FilterSetup.for_scenario(linear, states=True))
     assert "bias over temperature" in lanes.supports(plan)
     drawn_only = replace(warm, coefficients=np.zeros((2, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3]))
@@ -286,9 +288,9 @@ def test_a_recording_is_corrected_by_the_table_of_its_gyro_or_by_another_one(mon
     other = replace(spec.temperature, reference=31.0)
     recording = hand_held.simulated(1, 0, 4.0)
     for options, wanted in (({}, spec.temperature), ({"temperature": other}, other)):
-        with pytest.raises(Reached) as found:
+        with pytest.raises(Reached) as reached:
             sd.estimate(recording, noise=spec, **options)
-        assert found.value.args[0] is wanted
+        assert reached.value.args[0] is wanted
 
 
 def test_lost_samples_keep_their_temperature():
@@ -308,9 +310,9 @@ def test_a_sensor_that_is_wrong_all_the_time_is_locked_out_once_however_many_str
     noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
     blocks = (error_states.GyroTemperature(slope_sigma=1e-5),)
     locked = replace(record, vectors=(scattered,))
-    found = estimation.run(locked, noise, start, blocks, gate=Gate(probability=0.999, recovery=None))
-    assert [event.kind for event in found.events] == ["lock-out"]
-    assert found.events[0].value == 400
+    estimate = estimation.run(locked, noise, start, blocks, gate=Gate(probability=0.999, recovery=None))
+    assert [event.kind for event in estimate.events] == ["lock-out"]
+    assert estimate.events[0].value == 400
 
 
 def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alike():
@@ -319,16 +321,16 @@ def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alik
     root = np.tril(random.standard_normal((10, 10))) + 5.0 * np.eye(10)  # attitude, bias, another state, the slopes
     P, values = root.T @ root, random.standard_normal(4)
     own, change, axis = slice(1, 4), 2.5, np.arange(3)
-    one = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P)
-    memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=one)
+    candidate = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P)
+    memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=candidate)
     state = estimation.State(attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, gate=memory)
-    found = driven.shifted(state, own, change)
+    shifted = driven.shifted(state, own, change)
     bias = axis + change * values[1:]
     wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
-    np.testing.assert_allclose(found.bias, bias)
-    np.testing.assert_allclose(found.gate.candidate.others, np.concatenate([bias, values]))
-    for moved in (found, found.gate.candidate):
+    np.testing.assert_allclose(shifted.bias, bias)
+    np.testing.assert_allclose(shifted.gate.candidate.others, np.concatenate([bias, values]))
+    for moved in (shifted, shifted.gate.candidate):
         np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
         np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
-    back = driven.shifted(found, own, -change)
+    back = driven.shifted(shifted, own, -change)
     np.testing.assert_allclose(back.covariance, P, rtol=1e-12)

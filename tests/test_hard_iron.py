@@ -25,7 +25,7 @@ def turned(iron, duration: float = 60.0, size: float = 1.0, noise: float = 0.2, 
     return field, np.roll(R.as_quat(), 1, axis=-1), time
 
 
-def found(field, frame, time, causal=True, known=None):
+def iron_of(field, frame, time, causal=True, known=None):
     known = np.ones(len(time), bool) if known is None else known
     return hard_iron.find(field, frame, time, known, STRENGTH, causal=causal)
 
@@ -34,7 +34,7 @@ def found(field, frame, time, causal=True, known=None):
 @pytest.mark.parametrize("oblique", [True, False])
 def test_strong_iron_is_found_to_within_a_percent_of_the_field(causal, oblique):
     iron = np.array([6.0, -3.0, 12.0])
-    result = found(*turned(iron, oblique=oblique), causal=causal)
+    result = iron_of(*turned(iron, oblique=oblique), causal=causal)
     np.testing.assert_allclose(result[-1], iron, atol=0.01 * STRENGTH)
     # From all samples it is known at the start too; from those so far there is none yet.
     np.testing.assert_allclose(result[0], 0.0 if causal else iron, atol=0.01 * STRENGTH)
@@ -42,20 +42,20 @@ def test_strong_iron_is_found_to_within_a_percent_of_the_field(causal, oblique):
 
 def test_weak_iron_is_left_for_what_a_field_along_a_path_may_feign():
     """1.8 % of the field; at 5 % a share of (2.8 / 5)² stays."""
-    assert not found(*turned(0.018 * STRENGTH * np.array([0.0, 1.0, 0.0]), noise=0.0)).any()
-    some = found(*turned(0.05 * STRENGTH * np.array([0.0, 1.0, 0.0]), noise=0.0), causal=False)
+    assert not iron_of(*turned(0.018 * STRENGTH * np.array([0.0, 1.0, 0.0]), noise=0.0)).any()
+    some = iron_of(*turned(0.05 * STRENGTH * np.array([0.0, 1.0, 0.0]), noise=0.0), causal=False)
     assert some[1000, 1] / STRENGTH == pytest.approx(0.05 * (1.0 - (0.028 / 0.05) ** 2), rel=0.03)
 
 
 def test_iron_that_no_turn_shows_is_none():
-    assert not found(*turned([6.0, -3.0, 12.0], size=0.0)).any()
-    assert not found(*turned([6.0, -3.0, 12.0], duration=0.6)).any()
+    assert not iron_of(*turned([6.0, -3.0, 12.0], size=0.0)).any()
+    assert not iron_of(*turned([6.0, -3.0, 12.0], duration=0.6)).any()
 
 
 def test_each_row_depends_on_those_up_to_it():
     field, frame, time = turned([6.0, -3.0, 12.0])
     part = slice(0, 1200)
-    both = found(field, frame, time)[part], found(field[part], frame[part], time[part])
+    both = iron_of(field, frame, time)[part], iron_of(field[part], frame[part], time[part])
     np.testing.assert_allclose(*both, atol=1e-9)
 
 
@@ -63,7 +63,7 @@ def test_a_fixed_frame_that_is_turned_changes_nothing():
     field, frame, time = turned([6.0, -3.0, 12.0])
     T = Rotation.from_rotvec([0.3, -0.5, 1.1])
     other = np.roll((T * Rotation.from_quat(np.roll(frame, -1, axis=-1))).as_quat(), 1, axis=-1)
-    np.testing.assert_allclose(found(T.apply(field), other, time), found(field, frame, time), atol=1e-9)
+    np.testing.assert_allclose(iron_of(T.apply(field), other, time), iron_of(field, frame, time), atol=1e-9)
 
 
 def test_pairs_without_a_field_or_over_a_gap_are_left_out():
@@ -73,7 +73,7 @@ def test_pairs_without_a_field_or_over_a_gap_are_left_out():
     known[600:700] = False
     wrong = field.copy()
     wrong[600:700] = 1e3
-    np.testing.assert_allclose(found(wrong, frame, time, known=known)[-1], iron, atol=0.01 * STRENGTH)
+    np.testing.assert_allclose(iron_of(wrong, frame, time, known=known)[-1], iron, atol=0.01 * STRENGTH)
     # The gyro's frame is another one after a gap.
     after = time > 30.0
     T = Rotation.from_rotvec([0.0, 0.0, 2.0])
@@ -81,13 +81,13 @@ def test_pairs_without_a_field_or_over_a_gap_are_left_out():
     other = np.where(
         after[:, None], np.roll((T * Rotation.from_quat(np.roll(frame, -1, axis=-1))).as_quat(), 1, axis=-1), frame
     )
-    np.testing.assert_allclose(found(broken, other, time + 5.0 * after)[-1], iron, atol=0.01 * STRENGTH)
+    np.testing.assert_allclose(iron_of(broken, other, time + 5.0 * after)[-1], iron, atol=0.01 * STRENGTH)
 
 
 def test_iron_is_forgotten():
     """Iron that is gone for four time constants."""
     time = STEP * np.arange(1, round(300.0 / STEP) + 1)
     iron = np.where((time < 60.0)[:, None], [6.0, -3.0, 12.0], 0.0)
-    result = found(*turned(iron, duration=300.0))
+    result = iron_of(*turned(iron, duration=300.0))
     assert np.linalg.norm(result[round(60.0 / STEP) - 1]) > 12.0
     assert np.linalg.norm(result[-1]) < 0.01 * STRENGTH

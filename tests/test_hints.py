@@ -20,7 +20,7 @@ PACKAGE = Path(strapdown.__file__).parent
 def options() -> set[str]:
     register()
     commands = typer.main.get_command(app).commands.values()
-    return {name for one in commands for part in one.params for name in (*part.opts, *part.secondary_opts)}
+    return {name for command in commands for part in command.params for name in (*part.opts, *part.secondary_opts)}
 
 
 @functools.cache

@@ -69,7 +69,7 @@ def test_a_log_on_which_the_library_goes_back_for_ever_is_refused_with_the_place
 def test_a_log_of_messages_with_too_many_fields_is_refused(tmp_path, formats):
     path = tmp_path / "fields.ulg"
     subscription = block(b"A", b"\0\0\0sensor_combined")
-    path.write_bytes(ULOG + b"".join(block(b"F", one) for one in formats) + subscription)
+    path.write_bytes(ULOG + b"".join(block(b"F", declaration) for declaration in formats) + subscription)
     refused(path, r"fields\.ulg cannot be read: its message \w+ has more than 65535 fields")
 
 
@@ -188,9 +188,9 @@ def test_rows_of_wrong_types_are_left_out_and_reported(tmp_path):
         with contextlib.closing(sqlite3.connect(damaged)) as held:
             held.execute(f"UPDATE messages SET {change} WHERE id = (SELECT min(id) FROM messages WHERE topic_id = 1)")
             held.commit()
-        found = recordings.read(damaged)
-        np.testing.assert_array_equal(found.rate, whole.rate[1:])
-        assert "1 messages are of no topic" in " ".join(found.remarks)
+        recording = recordings.read(damaged)
+        np.testing.assert_array_equal(recording.rate, whole.rate[1:])
+        assert "1 messages are of no topic" in " ".join(recording.remarks)
 
 
 def test_a_folder_whose_storage_is_a_pipe_is_refused_at_once(tmp_path):
@@ -210,7 +210,7 @@ def test_reading_a_bag_takes_time_in_proportion_to_its_topics(tmp_path):
     def bag(number: int) -> float:
         records = [bag_files.ROS1]
         definition = b"".join(
-            struct.pack("<I", len(one)) + one for one in (b"type=sensor_msgs/Imu", b"message_definition=")
+            struct.pack("<I", len(field)) + field for field in (b"type=sensor_msgs/Imu", b"message_definition=")
         )
         for k in range(number):
             conn = struct.pack("<I", k)

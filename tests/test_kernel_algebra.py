@@ -130,7 +130,7 @@ def test_limit_at_zero_is_exact(name):
 def test_plain_numbers_and_arrays_agree_to_the_bit(name):
     function = CLOSED_FORMS[name][0]
     x = np.linspace(0.0, series.LARGEST_ANGLE**2, 23)
-    np.testing.assert_array_equal(function(x), [function(float(one)) for one in x])
+    np.testing.assert_array_equal(function(x), [function(float(value)) for value in x])
 
 
 def test_polynomial_is_the_polynomial():

@@ -232,14 +232,14 @@ BODIES = [
 
 def parts_used() -> set[tuple[str, ...]]:
     """What the package's calls of ``compiled(walk, …)`` name."""
-    found = set()
+    parts = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "compiled" and node.args:
                 first, *others = node.args
                 if getattr(first, "id", "") == "walk":
-                    found.add(tuple(ast.unparse(one) for one in others))
-    return found
+                    parts.add(tuple(ast.unparse(part) for part in others))
+    return parts
 
 
 def test_every_body_of_the_walk_is_listed_here():
@@ -255,7 +255,9 @@ def test_every_body_of_the_walk_is_listed_here():
     }
 
 
-@pytest.mark.parametrize("parts", BODIES, ids=lambda parts: " ".join(one.__name__.rpartition(".")[2] for one in parts))
+@pytest.mark.parametrize(
+    "parts", BODIES, ids=lambda parts: " ".join(part.__name__.rpartition(".")[2] for part in parts)
+)
 def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts):
     plain_kernels.plain(walk, *parts)  # raises where one that is reached is not defined
     for module in (sys.modules[walk.__module__], *parts):
@@ -481,7 +483,7 @@ with warnings.catch_warnings(record=True) as caught:
     from strapdown.kernels import machine, probe
     fast = machine.compiled(probe.run)
     values = fast(1.0), fast(1), fast(True)
-answer = values, sum(fast.stats.cache_hits.values()), [f"{one.category.__name__}: {one.message}" for one in caught]
+answer = values, sum(fast.stats.cache_hits.values()), [f"{warning.category.__name__}: {warning.message}" for warning in caught]
 """
 
 
@@ -535,8 +537,8 @@ def test_a_cache_that_cannot_be_written_ends_no_run(copied_kernels, fault):
         code = f"import numba; numba.config.CACHE_DIR = {os.devnull!r}\n" + code
     else:
         code = code.replace("values =", "import shutil; shutil.rmtree(fast._cache.cache_path)\n    values =")
-    found, _, warned = in_a_new_process(root, code)
-    assert found == values
+    computed, _, warned = in_a_new_process(root, code)
+    assert computed == values
     assert len(warned) == (fault == "full disk")
     assert all("compiled kernels cannot be stored" in words for words in warned)
 

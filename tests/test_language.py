@@ -30,9 +30,9 @@ DIALECT = {
 def dialect(text: str) -> list[str]:
     """Return what of the dialect a text holds, each with its line and the field's words."""
     return [
-        f"{text.count(chr(10), 0, found.start()) + 1}: {found.group()!r}; better: {better}"
+        f"{text.count(chr(10), 0, match.start()) + 1}: {match.group()!r}; better: {better}"
         for words, better in DIALECT.items()
-        for found in re.finditer(words, text)
+        for match in re.finditer(words, text)
     ]
 
 
@@ -62,8 +62,8 @@ def test_names_say_what_a_value_is():
 
 
 def test_prose_and_names_are_the_fields():
-    found = {str(path.relative_to(ROOT)): dialect(path.read_text(encoding="utf-8")) for path in FILES}
-    assert {path: words for path, words in found.items() if words} == {}
+    findings = {str(path.relative_to(ROOT)): dialect(path.read_text(encoding="utf-8")) for path in FILES}
+    assert {path: words for path, words in findings.items() if words} == {}
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def given_late(record, live, latency):
         for series, delays in zip(record.vectors, latency, strict=True)
         for k, (time, delay) in enumerate(zip(series.time, delays, strict=True))
     ]
-    late.sort(key=lambda one: one[:3])
+    late.sort(key=lambda measurement: measurement[:3])
     for k, increment in enumerate(record.increments):
         live.update(record.time[k + 1], delta_theta=increment)
         while late and late[0][0] <= record.time[k + 1]:
@@ -79,19 +79,19 @@ def given_late(record, live, latency):
     return live
 
 
-def same(one, other):
+def same(first, second):
     """Whether two states are equal to the bit."""
     parts = ("attitude", "bias", "values", "covariance")
-    return all(np.array_equal(getattr(one, part), getattr(other, part)) for part in parts)
+    return all(np.array_equal(getattr(first, part), getattr(second, part)) for part in parts)
 
 
-def apart(one, other):
+def apart(first, second):
     """How far two states are from each other, over the σ of the second."""
-    sigma = np.sqrt(np.diag(other.covariance))
+    sigma = np.sqrt(np.diag(second.covariance))
     state = np.concatenate(
-        [2.0 * (one.attitude - other.attitude)[1:], one.bias - other.bias, one.values - other.values]
+        [2.0 * (first.attitude - second.attitude)[1:], first.bias - second.bias, first.values - second.values]
     )
-    covariance = (one.covariance - other.covariance) / np.outer(sigma, sigma)
+    covariance = (first.covariance - second.covariance) / np.outer(sigma, sigma)
     return max(np.abs(state / sigma).max(), np.abs(covariance).max())
 
 
@@ -109,18 +109,20 @@ def quick(states, option):
     ],
 )
 def test_equals_the_record(states, option):
-    record, given, blocks = record_for(states), OPTIONS[option], STATES[states]
+    record, options, blocks = record_for(states), OPTIONS[option], STATES[states]
     initial = begun(record, option)
-    live = given_in_order(record, live_of(record, initial, blocks, **given))
-    estimate, end = estimation.run_part(record, NOISE, initial, blocks, **given)
+    live = given_in_order(record, live_of(record, initial, blocks, **options))
+    estimate, end = estimation.run_part(record, NOISE, initial, blocks, **options)
     assert same(live.state(), end)
-    assert live.refused == {name: one.refused for name, one in estimate.innovations.items()}
+    assert live.refused == {name: innovations.refused for name, innovations in estimate.innovations.items()}
     assert [(e.kind, e.start, e.end, e.sensor) for e in live.events] == [
         (e.kind, e.start, e.end, e.sensor) for e in estimate.events
     ]
-    for name, seen in live.innovations.items():
-        assert seen.innovation[-1] == pytest.approx(estimate.innovations[name].innovation[-1], rel=1e-6, abs=1e-12)
-        assert seen.used[-1] == estimate.innovations[name].used[-1]
+    for name, innovations in live.innovations.items():
+        assert innovations.innovation[-1] == pytest.approx(
+            estimate.innovations[name].innovation[-1], rel=1e-6, abs=1e-12
+        )
+        assert innovations.used[-1] == estimate.innovations[name].used[-1]
     assert len(live.innovations) == len(record.vectors)
 
 
@@ -128,20 +130,23 @@ def test_equals_the_record(states, option):
 def test_error_states_equal_the_record_to_the_bit(option):
     """Between the gyro's edges too, with missing measurements, an interval that is divided into sub-steps, and from rates."""
     record, blocks = record_for("walk and velocity"), STATES["walk and velocity"]
-    given = {"gate": Gate(probability=0.99 if option != "lost" else 0.9999, recovery=4), "robust": Robust(kind="huber")}
+    options = {
+        "gate": Gate(probability=0.99 if option != "lost" else 0.9999, recovery=4),
+        "robust": Robust(kind="huber"),
+    }
     rates = record.increments / np.diff(record.time)[:, None]
     rates[40] *= 100.0
     fewer = tuple(s.taken(np.arange(len(s.time)) % 7 != i) for i, s in enumerate(record.vectors))
     increments = rates * np.diff(record.time)[:, None]
     record = replace(record, increments=increments, vectors=fewer, truth=None, origin=None)
     initial = begun(record_for("walk and velocity"), option)
-    live = live_of(record, initial, blocks, **given)
+    live = live_of(record, initial, blocks, **options)
     for k, rate in enumerate(rates):
         now = {s.sensor: sample(s, int(i)) for s in fewer for i in np.flatnonzero(s.time == record.time[k + 1])}
         live.update(record.time[k + 1], rate, **now)
-    estimate, end = estimation.run_part(record, NOISE, initial, blocks, **given)
+    estimate, end = estimation.run_part(record, NOISE, initial, blocks, **options)
     assert same(live.state(), end)
-    assert sum(live.refused.values()) == sum(one.refused for one in estimate.innovations.values()) > 0
+    assert sum(live.refused.values()) == sum(innovations.refused for innovations in estimate.innovations.values()) > 0
 
 
 @pytest.mark.parametrize("shifts", [(0.0, 0.0, 0.0, 0.0), (0.0, -0.0071, -0.003, -0.003)], ids=["edges", "between"])
@@ -155,7 +160,7 @@ def test_error_states_equal_the_record_to_the_bit(option):
 )
 def test_late_measurements_lead_to_the_same_bits(states, option, shifts):
     """All at common stamps, which are the gyro's edges, or most between them; the first sensor's begin at the start."""
-    record, given, blocks = record_for(states), OPTIONS[option], STATES[states]
+    record, options, blocks = record_for(states), OPTIONS[option], STATES[states]
     moved = tuple(
         replace(s, time=s.time - s.time[0] * (i == 0) + shift)
         for i, (s, shift) in enumerate(zip(record.vectors, shifts, strict=False))
@@ -165,13 +170,13 @@ def test_late_measurements_lead_to_the_same_bits(states, option, shifts):
     draw = generator(3, 0, "latency")
     latency = [draw.uniform(0.0, 0.2, len(series.time)) for series in record.vectors]
     latency[-1][:] = 0.0  # in time, but last in the order of the sensors
-    live = given_late(record, live_of(record, initial, blocks, look_back=0.25, **given), latency)
+    live = given_late(record, live_of(record, initial, blocks, look_back=0.25, **options), latency)
     problem = forward.prepared(record, NOISE, initial, blocks)
-    passed = forward.filtered(problem, forward.Options(**given))
+    passed = forward.filtered(problem, forward.Options(**options))
     assert live.late == 0
     # All measurements lie in the record, the last ones in its last interval.
     assert same(live.state(), passed.end)
-    assert live.refused == {name: one.refused for name, one in passed.estimate.innovations.items()}
+    assert live.refused == {name: innovations.refused for name, innovations in passed.estimate.innovations.items()}
     assert [(e.kind, e.start, e.end, e.value) for e in live.events] == [
         (e.kind, e.start, e.end, e.value) for e in passed.estimate.events
     ]
@@ -235,8 +240,10 @@ def test_a_rate_is_its_increment_over_the_interval():
 
 
 def measured_as(kind, sigma, reference, value):
-    given = {"attitude": value[None]} if kind == "attitude" else {"vector_b": value[None], "reference_f": reference}
-    return VectorMeasurements(sensor="s", kind=kind, time=np.array([0.1]), sigma=np.array([sigma]), **given)
+    measurement = (
+        {"attitude": value[None]} if kind == "attitude" else {"vector_b": value[None], "reference_f": reference}
+    )
+    return VectorMeasurements(sensor="s", kind=kind, time=np.array([0.1]), sigma=np.array([sigma]), **measurement)
 
 
 @pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
@@ -314,9 +321,9 @@ def test_declared_sensors_are_those_of_a_scenario():
         motion=motion.ConstantRate(rate=(0, 0, 0.3)), gyro=GyroSpec(), sensors=(up, north), rate=10.0, duration=1
     )
     record = simulate(scenario)
-    one = given_in_order(record, live_of(record, start()))
-    other = given_in_order(record, LiveFilter(NOISE, start(), sensors=[up, north], time=record.time[0]))
-    assert same(one.state(), other.state())
+    live = given_in_order(record, live_of(record, start()))
+    declared = given_in_order(record, LiveFilter(NOISE, start(), sensors=[up, north], time=record.time[0]))
+    assert same(live.state(), declared.state())
 
 
 def test_too_many_measurements_in_an_interval():

@@ -54,12 +54,12 @@ def rows_live(recording: Recording, **options) -> tuple[np.ndarray, ...]:
 
 def need_equal(recording: Recording, parameters: AhrsParameters | None = None, **options) -> ahrs.AhrsEstimate:
     """Require the same bits in each row but the last; return the estimate of the recording."""
-    found = ahrs.estimate(recording, parameters, full_covariance=True, **options)
-    live = rows_live(found.recording, parameters=parameters, **options)
-    rows = found.estimate
+    result = ahrs.estimate(recording, parameters, full_covariance=True, **options)
+    live = rows_live(result.recording, parameters=parameters, **options)
+    rows = result.estimate
     for mine, its in zip(live, (rows.attitude, rows.bias, rows.variance, rows.covariance), strict=True):
         np.testing.assert_array_equal(mine[:-1], its[:-1])
-    return found
+    return result
 
 
 @pytest.mark.parametrize(
@@ -68,10 +68,10 @@ def need_equal(recording: Recording, parameters: AhrsParameters | None = None, *
     ids=["hand", "drifting", "six states"],
 )
 def test_each_sample_gives_the_row_of_the_recording(parameters):
-    found = need_equal(with_missing(swinging()), parameters)
-    assert (len(found.rests.last) > 3) == (parameters is DRIFTING)
-    assert found.rests.last.max(initial=0) < 600  # neither the swing nor the slow turn is a rest
-    assert not found.faults.words
+    result = need_equal(with_missing(swinging()), parameters)
+    assert (len(result.rests.last) > 3) == (parameters is DRIFTING)
+    assert result.rests.last.max(initial=0) < 600  # neither the swing nor the slow turn is a rest
+    assert not result.faults.words
 
 
 def test_a_magnetometer_with_iron_in_the_unit_and_a_disturbed_field():
@@ -84,9 +84,9 @@ def test_a_magnetometer_with_iron_in_the_unit_and_a_disturbed_field():
     field += generator(12, 0, "field").normal(0.0, 0.3, field.shape)
     field[5::13] = np.nan
     field[320:350] = 0.0
-    found = need_equal(replace(plain, magnetic_field=field))
-    assert not np.any(found.delays.field)
-    assert np.linalg.norm(found.hard_iron) > 1.0
+    result = need_equal(replace(plain, magnetic_field=field))
+    assert not np.any(result.delays.field)
+    assert np.linalg.norm(result.hard_iron) > 1.0
 
 
 def test_stamps_that_jitter_and_a_known_delay():
@@ -96,7 +96,7 @@ def test_stamps_that_jitter_and_a_known_delay():
 def test_a_row_of_a_recording_depends_on_the_samples_up_to_it_alone():
     whole = swinging()
     half = replace(whole, **{name: getattr(whole, name)[:1000] for name in ("time", "rate", "specific_force")})
-    first, second = (ahrs.estimate(one).estimate for one in (half, whole))
+    first, second = (ahrs.estimate(recording).estimate for recording in (half, whole))
     np.testing.assert_array_equal(first.attitude[:-1], second.attitude[:999])
     np.testing.assert_array_equal(first.variance[:-1], second.variance[:999])
 
@@ -105,8 +105,8 @@ def test_recordings_in_the_hand_and_of_an_aircraft(broad, monkeypatch):
     hand = read(broad / "07_undisturbed_fast_rotation_B.hdf5")
     need_equal(replace(hand, magnetic_field=None))
     monkeypatch.setattr(sensor_delays, "_fitted", lambda *_: (0.0, np.inf))
-    found = need_equal(hand)
-    assert found.rests.last.size
+    result = need_equal(hand)
+    assert result.rests.last.size
     aircraft = broad.parent / "euroc" / "V1_02_medium.hdf5"
     if not aircraft.exists():
         pytest.skip("the shared recordings of EuRoC are absent")
@@ -138,17 +138,17 @@ def test_it_starts_at_the_first_specific_force():
     ],
 )
 def test_bad_samples_are_refused_and_leave_the_filter_as_it_was(sample, message):
-    one, other = LiveAhrs(interval=0.01), LiveAhrs(interval=0.01)
+    first, second = LiveAhrs(interval=0.01), LiveAhrs(interval=0.01)
     for k in range(31):
-        for live in (one, other):
+        for live in (first, second):
             live.update(0.01 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
     with pytest.raises(InputError, match=message):
-        one.update(*sample)
+        first.update(*sample)
     for k in range(31, 50):
-        for live in (one, other):
+        for live in (first, second):
             live.update(0.01 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-    np.testing.assert_array_equal(one.attitude, other.attitude)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+    np.testing.assert_array_equal(first.attitude, second.attitude)
 
 
 @pytest.mark.parametrize(("name", "value"), [("magnetometer", "yes"), ("parameters", "vehicle")])

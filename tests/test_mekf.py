@@ -136,13 +136,13 @@ def test_one_interval_or_many_at_constant_rate_are_the_same():
     """The model is exact at constant rate: a turn of 3 rad in one interval (sub-steps) equals a thousand small ones."""
     turn = np.array([1.0, -2.0, 2.0])
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    one = estimation.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
+    coarse = estimation.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
     many = ImuRecord(time=np.linspace(0.0, 1.0, 1001), increments=np.tile(turn / 1000.0, (1000, 1)))
     fine = estimation.run(many, NOISE, initial, every=1000, full_covariance=True)
-    assert quaternion.angle_between(one.attitude[-1], fine.attitude[-1]) < 1e-13
-    assert quaternion.angle_between(one.attitude[-1], quaternion.exp(turn)) < 1e-14
-    d = np.sqrt(np.diag(one.covariance[-1]))
-    assert np.abs((one.covariance[-1] - fine.covariance[-1]) / np.outer(d, d)).max() < 1e-11
+    assert quaternion.angle_between(coarse.attitude[-1], fine.attitude[-1]) < 1e-13
+    assert quaternion.angle_between(coarse.attitude[-1], quaternion.exp(turn)) < 1e-14
+    d = np.sqrt(np.diag(coarse.covariance[-1]))
+    assert np.abs((coarse.covariance[-1] - fine.covariance[-1]) / np.outer(d, d)).max() < 1e-11
 
 
 def test_many_series_are_one_series_of_as_many_references():
@@ -151,11 +151,11 @@ def test_many_series_are_one_series_of_as_many_references():
     stars /= np.linalg.norm(stars, axis=1, keepdims=True)
     time = 0.01 * np.arange(301)
     body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
-    seen = quaternion.rotate(quaternion.conjugate(body.attitude(time[1:])), stars)
+    directions = quaternion.rotate(quaternion.conjugate(body.attitude(time[1:])), stars)
     each = tuple(
-        series_of(f"star {k}", "direction", [time[k + 1]], [seen[k]], star, 1e-3) for k, star in enumerate(stars)
+        series_of(f"star {k}", "direction", [time[k + 1]], [directions[k]], star, 1e-3) for k, star in enumerate(stars)
     )
-    whole = series_of("stars", "direction", time[1:], seen, stars, 1e-3)
+    whole = series_of("stars", "direction", time[1:], directions, stars, 1e-3)
     noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.1)
     ran = [
@@ -206,7 +206,7 @@ def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
     """Its noise, in body axes of its own time, turns back with it, and grows by the gyro's and by the bias's over the time between."""
     turn, bias, axes = np.array([0.8, -0.5, 1.1]), np.array([0.01, -0.02, 0.03]), np.array([1e-3, 2e-3, 5e-3])
     q = quaternion.exp([0.3, 0.2, -0.4])
-    seen = VectorMeasurements(
+    tracker = VectorMeasurements(
         sensor="t",
         kind="attitude",
         time=[*np.linspace(1.0, 1.5, 11), 2.0],
@@ -214,7 +214,7 @@ def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
         sigma_axes=axes,
     )
     increments = np.outer([1.0, 2.0], 0.5 * turn + bias)
-    record = ImuRecord(time=[0.0, 1.0, 3.0], increments=increments, vectors=(seen,))
+    record = ImuRecord(time=[0.0, 1.0, 3.0], increments=increments, vectors=(tracker,))
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0)
     state = estimation.first_state(record, noise, bias_sigma=2e-3, bias=bias)
     R = quaternion.to_matrix(quaternion.exp(turn))
@@ -226,7 +226,7 @@ def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
 def test_a_start_from_whole_vectors_is_that_from_their_directions():
     q, references = quaternion.exp([0.3, 0.2, -0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.6, -0.8]])
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0)
-    found = []
+    states = []
     for kind, length in (("direction", 1.0), ("vector", 20.0)):
         series = tuple(
             series_of(
@@ -240,9 +240,9 @@ def test_a_start_from_whole_vectors_is_that_from_their_directions():
             for k, r in enumerate(references)
         )
         record = resting(*series)
-        found.append(estimation.first_state(record, noise, bias_sigma=1e-3))
-    assert quaternion.angle_between(*(state.attitude for state in found)) < 1e-12
-    np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-9, atol=1e-18)
+        states.append(estimation.first_state(record, noise, bias_sigma=1e-3))
+    assert quaternion.angle_between(*(state.attitude for state in states)) < 1e-12
+    np.testing.assert_allclose(states[0].covariance, states[1].covariance, rtol=1e-9, atol=1e-18)
 
 
 @pytest.mark.parametrize(

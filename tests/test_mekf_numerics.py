@@ -39,8 +39,8 @@ def sharp_record(sigma, steps=400):
     series = []
     for k, r in enumerate(([1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0])):
         at = time[1 + k :: 3]
-        seen = quaternion.rotate(quaternion.conjugate(body.attitude(at)), np.array(r))
-        series.append(series_of(f"s{k}", "direction", at, seen, r, sigma))
+        directions = quaternion.rotate(quaternion.conjugate(body.attitude(at)), np.array(r))
+        series.append(series_of(f"s{k}", "direction", at, directions, r, sigma))
     return ImuRecord(time=time, increments=body.increments(time), vectors=tuple(series)), body.attitude(time)
 
 
@@ -211,10 +211,10 @@ def test_variances_are_those_in_sixty_digits(options, sensors, sigma, noise):
     """Against 60 digits: after one of the directions σ about it is still the prior's, 1e7 times more."""
     record, process, expected = sparse_record(sensors, sigma, noise)
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
-    chosen = {"gate": {"gate": OPTIONS}, "huber": {"robust": Robust(kind="huber")}}.get(options, {})
+    keywords = {"gate": {"gate": OPTIONS}, "huber": {"robust": Robust(kind="huber")}}.get(options, {})
     if options == "covariance":
         record = replace(record, vectors=tuple(by_covariance(s) for s in record.vectors))
-    estimate = taken_or_refused(sigma, record, process, start, **chosen)
+    estimate = taken_or_refused(sigma, record, process, start, **keywords)
     if estimate is not None:
         assert np.max(np.abs(estimate.variance / expected - 1.0)) < bound_of(sigma)
         assert least_eigenvalue(estimate.covariance) > -ROUNDING
@@ -287,14 +287,14 @@ def test_a_large_correction_is_exact(states, angle):
     others = tuple(series for series in SILENT if states and series.kind != "attitude")
     record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(*others, measured))
     start = initial_state(quaternion.IDENTITY, attitude_sigma=sigma, bias_sigma=1e-6)
-    found = estimation.run(record, NOISE, start, states, full_covariance=True)
+    estimate = estimation.run(record, NOISE, start, states, full_covariance=True)
     share = sigma**2 / (sigma**2 + r)
     theta = mpmath.mpf(share * angle)
     K = kinematics.skew(axis)
     J = np.eye(3) - float((1 - mpmath.cos(theta)) / theta) * K + float(1 - mpmath.sin(theta) / theta) * K @ K
     want = Rotation.from_rotvec(share * angle * axis).as_quat(scalar_first=True)
-    np.testing.assert_allclose(found.attitude[0], want, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found.covariance[0, :3, :3], r * share * J @ J.T, rtol=0, atol=3e-15 * r)
+    np.testing.assert_allclose(estimate.attitude[0], want, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(estimate.covariance[0, :3, :3], r * share * J @ J.T, rtol=0, atol=3e-15 * r)
 
 
 # ----------------------------------------------------------------------------------------------- against the square root of the covariance
@@ -362,9 +362,9 @@ def test_variances_are_those_of_the_square_root(sigma, sharp, start_sigma, bound
     if estimate is None:
         return
     whole = estimate.covariance if not states else estimate.whole_covariance
-    found = np.einsum("kii->ki", whole)[1:]
-    assert np.all(found > 0.0)
-    assert np.max(np.abs(found / expected - 1.0)) < bound
+    variance = np.einsum("kii->ki", whole)[1:]
+    assert np.all(variance > 0.0)
+    assert np.max(np.abs(variance / expected - 1.0)) < bound
     error = np.concatenate([turn_to(attitude, estimate.attitude[1:]), bias - estimate.bias[1:]], axis=1)
     if bound == 1e-6:
         assert np.max(np.abs(error) / np.sqrt(expected[:, :6])) < bound
@@ -388,12 +388,12 @@ def test_positive_definite_and_steady_over_a_long_run(parts, steps):
     )
     record = ImuRecord(time=time, increments=body.increments(time), vectors=series)
     state = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
-    seen = []
+    covariances = []
     for _ in range(parts):
         whole, state = estimation.run_part(record, NOISE, state, every=steps // 10, full_covariance=True)
-        seen.append(whole.covariance[1:])
+        covariances.append(whole.covariance[1:])
         assert abs(np.linalg.norm(state.attitude) - 1.0) < 1e-14
-    P = np.concatenate(seen)  # whole turns apart
+    P = np.concatenate(covariances)  # whole turns apart
     assert least_eigenvalue(P) > 1e-3
     d = np.sqrt(np.diag(P[0]))
     assert np.abs((P - P[0]) / np.outer(d, d)).max() < 1e-9

@@ -49,20 +49,20 @@ def sensors(faults=OUTLIERS, rate=10.0):
     }
 
 
-def scenario(chosen, duration=4.0, angle=0.3, frequency=0.3):
+def scenario(sensor_set, duration=4.0, angle=0.3, frequency=0.3):
     return Scenario(
         motion=motion.Coning(angle=angle, frequency=frequency),
         gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias=np.array([1e-3, -2e-3, 5e-4])),
-        sensors=chosen,
+        sensors=sensor_set,
         rate=50.0,
         duration=duration,
     )
 
 
 SCHEDULES = {
-    "at one time": lambda chosen: chosen,
-    "asynchronous": lambda chosen: tuple(
-        replace(s, rate=s.rate * (1.0 + 0.37 * k), phase=0.0123 * (k + 1)) for k, s in enumerate(chosen)
+    "at one time": lambda sensor_set: sensor_set,
+    "asynchronous": lambda sensor_set: tuple(
+        replace(s, rate=s.rate * (1.0 + 0.37 * k), phase=0.0123 * (k + 1)) for k, s in enumerate(sensor_set)
     ),
 }
 
@@ -82,15 +82,15 @@ def anisotropic(record, whole, run=0):
         added = size[:, :, None] ** 2 * (factor @ factor.T) if whole else axes[:, :, None] ** 2 * np.eye(3)
         noise = np.einsum("kij,kj->ki", np.linalg.cholesky(added), draw.standard_normal((m, 3)))
         covariance = s.covariances + added
-        given = {"covariance": covariance} if whole else {"sigma_axes": np.sqrt(np.einsum("kii->ki", covariance))}
+        fields = {"covariance": covariance} if whole else {"sigma_axes": np.sqrt(np.einsum("kii->ki", covariance))}
         if s.kind == "attitude":
-            given = {"sigma_axes": None, **given}
-            changed = replace(s, attitude=quaternion.multiply(s.attitude, quaternion.exp(noise)), **given)
+            fields = {"sigma_axes": None, **fields}
+            changed = replace(s, attitude=quaternion.multiply(s.attitude, quaternion.exp(noise)), **fields)
         else:
             value = s.vector_b + noise
             if s.kind == "direction":
                 value /= np.linalg.norm(value, axis=1, keepdims=True)
-            changed = replace(s, vector_b=value, sigma=0.0, **given)
+            changed = replace(s, vector_b=value, sigma=0.0, **fields)
         series.append(changed)
     return replace(record, vectors=tuple(series))
 
@@ -141,24 +141,24 @@ def quick(option, kind):
 
     A gate of headings: tests/test_robustness.py; with noise by axis: tests/test_multiple_model.py.
     """
-    given, whole = OPTIONS[option]
-    return not given or (whole is None and kind != "heading")
+    options, whole = OPTIONS[option]
+    return not options or (whole is None and kind != "heading")
 
 
 @pytest.mark.parametrize(
     ("option", "kind", "schedule"),
-    [pytest.param(*one, marks=[] if quick(*one[:2]) else pytest.mark.slow) for one in alternating()],
+    [pytest.param(*case, marks=[] if quick(*case[:2]) else pytest.mark.slow) for case in alternating()],
 )
 def test_both_faces_are_one_filter(option, kind, schedule):
-    given, whole = OPTIONS[option]
+    options, whole = OPTIONS[option]
     record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=2.0), 5)
     if whole is not None:
         record = anisotropic(record, whole)
-    result = estimation.run(record, NOISE, near(record), full_covariance=True, **given)
-    f, (attitude, bias, P), taken = stepped(record, near(record), **given)
+    result = estimation.run(record, NOISE, near(record), full_covariance=True, **options)
+    f, (attitude, bias, P), taken = stepped(record, near(record), **options)
     assert_same(result, attitude, bias, P)
     assert sum(f.refused.values()) == sum(result.refused.values()) == len(taken) - sum(taken)
-    if "gate" in given:
+    if "gate" in options:
         assert sum(f.refused.values()) > 0  # the outliers
 
 
@@ -175,7 +175,7 @@ def drawn(kind, schedule, run):
 
 def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
     """Over independent runs, the verdicts on the attitude and on all states at four epochs, and the mean NIS per degree with its bounds."""
-    given, whole = OPTIONS[option]
+    options, whole = OPTIONS[option]
     nees, nis = [], []
     for run in range(runs):
         record, draw = drawn(kind, schedule, run)
@@ -183,13 +183,13 @@ def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
             record = anisotropic(record, whole, run)
         start = drawn_start(record.truth, draw, 1e-2, 1e-3)
         modelled = replace(record, vectors=tuple(s.noise_scaled(sigma_factor) for s in record.vectors))
-        result = estimation.run(modelled, NOISE, start, every=50, full_covariance=True, **given)
+        result = estimation.run(modelled, NOISE, start, every=50, full_covariance=True, **options)
         e = errors(result, record.truth, 50)[1:]
         P = result.covariance[1:]
         nees.append([consistency.nees(e[:, :3], P[:, :3, :3]) / 3.0, consistency.nees(e, P) / 6.0])
-        nis += [one.innovation**2 / one.variance for one in result.innovations.values()]
+        nis += [innovations.innovation**2 / innovations.variance for innovations in result.innovations.values()]
     mean = np.mean(nees, axis=0)
-    squares = np.concatenate([one.ravel() for one in nis])
+    squares = np.concatenate([values.ravel() for values in nis])
     return [
         consistency.Verdict(mean=mean[k], degrees=degrees, runs=runs, probability=1.0 - 0.01 / GRID)
         for k, degrees in enumerate((3, 6))
@@ -221,19 +221,19 @@ def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs
 @pytest.mark.parametrize("kind", sensors())
 def test_the_plain_filter_is_consistent_over_thousands_of_runs_and_not_with_sigma_a_tenth_off(kind, schedule):
     """ANEES of attitude, bias and both; 99 % over the whole grid."""
-    found = {}
+    verdicts = {}
     off = 1.1 if ("plain", kind, schedule) in alternating() else 1.0 / 1.1
     for factor in (1.0, off):
         belief = FilterSetup(process_noise=NOISE, attitude_sigma=1e-2, bias_sigma=1e-3, measurement_sigma_factor=factor)
-        chosen = scenario(SCHEDULES[schedule](sensors(Faults())[kind]))
-        plan = montecarlo.Plan(scenario=chosen, setup=belief, seed=21, epochs=4)
+        scene = scenario(SCHEDULES[schedule](sensors(Faults())[kind]))
+        plan = montecarlo.Plan(scenario=scene, setup=belief, seed=21, epochs=4)
         statistics = montecarlo.run_plan(plan, runs=4000)
         assert statistics.failed == 0
         for subset in ("state", "attitude", "bias"):
-            found[factor, subset] = statistics.verdict(np.arange(1, 5), subset, 1.0 - 0.01 / 32)
+            verdicts[factor, subset] = statistics.verdict(np.arange(1, 5), subset, 1.0 - 0.01 / 32)
         low, high = statistics.nis_bounds(1.0 - 0.01 / 32)
         assert (low < statistics.mean_nis < high) == (factor == 1.0)
-    for (factor, subset), verdict in found.items():
+    for (factor, subset), verdict in verdicts.items():
         assert verdict.consistent == (factor == 1.0), (factor, subset, verdict.mean, verdict.simultaneous_bounds)
 
 
@@ -266,12 +266,12 @@ def test_both_faces_recover_alike(kind, whole):
 @pytest.mark.parametrize("case", ["step", "one direction", "too little noise", "faulty"])
 def test_both_faces_restart_and_report_lock_outs_alike(case):
     """Failed candidates, widened ones, a turn that is not known, lock-outs that a recovery ends and that it does not."""
-    chosen = sensors(Faults())["direction"]
+    sensor_set = sensors(Faults())["direction"]
     if case == "one direction":
-        chosen = chosen[:1]
+        sensor_set = sensor_set[:1]
     elif case == "faulty":
-        chosen = (*chosen, VectorSensor(name="c", reference_f=np.array([0.3, -1.0, 1.0]), sigma=1e-3, rate=7.0))
-    record = simulate(scenario(chosen, duration=4.0), 5)
+        sensor_set = (*sensor_set, VectorSensor(name="c", reference_f=np.array([0.3, -1.0, 1.0]), sigma=1e-3, rate=7.0))
+    record = simulate(scenario(sensor_set, duration=4.0), 5)
     start, options = near(record, (1e-4, -2e-4, 1e-4), sigma=1e-3), {"gate": Gate(recovery=5), "robust": None}
     if case == "step":
         later = (np.arange(len(record.increments)) >= 60)[:, None]
@@ -322,8 +322,8 @@ def test_a_gap_of_the_gyro_is_reported_and_grows_the_covariance_as_the_closed_fo
 
 
 def test_an_outage_of_all_measurements_grows_the_covariance_and_ends_consistent():
-    chosen = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
-    record = simulate(scenario(chosen, duration=4.0), 5)
+    sensor_set = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
+    record = simulate(scenario(sensor_set, duration=4.0), 5)
     estimate = estimation.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
     assert not sum(estimate.refused.values())
     growth = estimate.variance[149, 3:] - estimate.variance[50, 3:]

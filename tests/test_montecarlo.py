@@ -142,23 +142,24 @@ def test_the_start_is_drawn_from_the_prior():
 def held_against_theory(runs, seed, machine):
     result = sim.main(runs=runs, seed=seed, machine=machine)
     for name, predicted in result.predictions.items():
-        found = result.statistics[name]
+        statistics = result.statistics[name]
         # 100 epochs × 3 subsets × 5 filters, and 300 spans of NIS: 4.5σ is passed by chance in one of some 50 such tests.
         for column, subset in enumerate(("state", "attitude", "bias")):
-            off = (found.anees[1:, column] - predicted.anees(subset)[1:]) / predicted.standard_error(subset, runs)[1:]
+            spread = predicted.standard_error(subset, runs)[1:]
+            off = (statistics.anees[1:, column] - predicted.anees(subset)[1:]) / spread
             assert np.abs(off).max() < 4.5, (name, subset)
-        off = (found.nis / predicted.nis - 1.0) / np.sqrt(2.0 / (3.0 * runs))
+        off = (statistics.nis / predicted.nis - 1.0) / np.sqrt(2.0 / (3.0 * runs))
         assert np.abs(off).max() < 4.5, name
-        P = np.einsum("mii->mi", found.covariance)
+        P = np.einsum("mii->mi", statistics.covariance)
         modelled = np.einsum("mii->mi", predicted.covariance)
         assert np.allclose(P[:, :3], modelled[:, :1], rtol=1e-4)
         assert np.allclose(P[:, 3:], modelled[:, 1:], rtol=1e-4)
         # the true spread, Σ e eᵀ over the runs, against its own sampling error
-        square = np.einsum("mii->mi", found.mean_square_error)[1:]
+        square = np.einsum("mii->mi", statistics.mean_square_error)[1:]
         true = np.einsum("mii->mi", predicted.true_covariance)[1:]
         ratio = square.reshape(-1, 2, 3).mean(axis=2) / true
         assert np.abs(ratio - 1.0).max() < 4.5 * np.sqrt(2.0 / (3.0 * runs)), name
-        assert montecarlo.summary(found)["consistent"] == (name == "right"), name
+        assert montecarlo.summary(statistics)["consistent"] == (name == "right"), name
 
 
 def test_mismatched_filters_fail_by_as_much_as_theory_says():

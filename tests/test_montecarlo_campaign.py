@@ -432,10 +432,10 @@ def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(
     ratio = []
     for run in range(40):
         # The drift of the increments beside those of a perfect scale factor, of the same noise, is the error drawn.
-        one, other = (scalar.record_of(each, run).increments for each in (plan, exact))
-        turn = other.sum(axis=0)
+        flawed, perfect = (scalar.record_of(each, run).increments for each in (plan, exact))
+        turn = perfect.sum(axis=0)
         k = int(np.argmax(np.abs(turn) * np.abs(SCENARIO.gyro.scale_factor)))
-        ratio.append((one - other).sum(axis=0)[k] / turn[k] / SCENARIO.gyro.scale_factor[k])
+        ratio.append((flawed - perfect).sum(axis=0)[k] / turn[k] / SCENARIO.gyro.scale_factor[k])
     assert abs(np.mean(ratio)) < 3.5 / np.sqrt(40)
     assert 0.65 < np.std(ratio) < 1.4
 
@@ -493,12 +493,12 @@ def test_the_command_refuses(command, arguments, message, tmp_path):
 @pytest.fixture
 def heeded():
     """Signals as a program has them that was started in the foreground; tests may run in the background, with SIGINT ignored."""
-    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    before = {signal_number: signal.getsignal(signal_number) for signal_number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     yield
-    for one, handler in before.items():
-        signal.signal(one, handler)
+    for signal_number, handler in before.items():
+        signal.signal(signal_number, handler)
 
 
 @pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM"])

@@ -40,11 +40,11 @@ def client():
 
 def test_dask_gives_the_bits_of_one_process(client):
     reported = []
-    found = montecarlo.run_plan(
+    statistics = montecarlo.run_plan(
         PLAN, runs=43, chunk=4, machine="scalar", workers=cluster.on_dask(client), progress=reported.append
     )
     assert sum(reported) == 43
-    assert_same(found, alone(43, 4))
+    assert_same(statistics, alone(43, 4))
 
 
 def test_a_plan_is_unpacked_once_a_worker(client):
@@ -60,9 +60,9 @@ def test_scenarios_of_ones_own_go_to_the_workers_too(client):
                 raise AttributeError(name)
             return getattr(SCENARIO.motion, name)
 
-    one = replace(PLAN, scenario=replace(SCENARIO, motion=Wobble()))
-    found = montecarlo.run_plan(one, runs=6, chunk=2, machine="scalar", workers=cluster.on_dask(client))
-    assert_same(found, alone(6, 2))
+    plan = replace(PLAN, scenario=replace(SCENARIO, motion=Wobble()))
+    statistics = montecarlo.run_plan(plan, runs=6, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+    assert_same(statistics, alone(6, 2))
 
 
 def test_an_error_on_a_worker_comes_out(client):
@@ -156,8 +156,8 @@ def test_an_encrypted_scheduler_is_reached_with_the_certificates_of_dask(certifi
         address = local.scheduler_address
         assert address.startswith("tls://127.0.0.1:")
         with cluster.dask_client(address=address) as here:
-            found = montecarlo.run_plan(PLAN, runs=8, chunk=4, machine="scalar", workers=cluster.on_dask(here))
-        assert_same(found, alone(8, 4))
+            statistics = montecarlo.run_plan(PLAN, runs=8, chunk=4, machine="scalar", workers=cluster.on_dask(here))
+        assert_same(statistics, alone(8, 4))
         with dask.config.set(dict.fromkeys(certificates)):
             for wrong in (address, address.replace("tls://", "tcp://")):
                 with (
@@ -203,8 +203,8 @@ def test_bad_clusters_are_refused(monkeypatch):
 @pytest.mark.parametrize(("workers", "machine"), [(1, "scalar"), (2, "scalar"), (3, "scalar"), (2, "lanes")])
 def test_worker_processes_give_the_bits_of_one_process(workers, machine):
     with cluster.dask_client(workers=workers) as client:
-        found = montecarlo.run_plan(PLAN, runs=60, chunk=4, machine=machine, workers=cluster.on_dask(client))
-    assert_same(found, montecarlo.run_plan(PLAN, runs=60, chunk=4, threads=1, machine=machine))
+        statistics = montecarlo.run_plan(PLAN, runs=60, chunk=4, machine=machine, workers=cluster.on_dask(client))
+    assert_same(statistics, montecarlo.run_plan(PLAN, runs=60, chunk=4, threads=1, machine=machine))
 
 
 @pytest.mark.slow
@@ -242,7 +242,7 @@ def test_a_killed_worker_costs_only_its_chunk(tmp_path):
 
         with cluster.dask_client(address=where) as here:
             assert len(here.nthreads()) == 2
-            found = montecarlo.run_plan(
+            statistics = montecarlo.run_plan(
                 plan, runs=160, chunk=4, machine="scalar", workers=cluster.on_dask(here), progress=progress
             )
             assert len(here.nthreads()) == 1
@@ -253,5 +253,5 @@ def test_a_killed_worker_costs_only_its_chunk(tmp_path):
         for process in (*workers, scheduler):
             process.kill()
             process.wait()
-    assert_same(found, alone(160, 4, plan))
+    assert_same(statistics, alone(160, 4, plan))
     assert strapdown.__version__

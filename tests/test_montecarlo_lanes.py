@@ -148,8 +148,8 @@ def test_fixed_errors_and_dispersions():
     np.testing.assert_allclose(s.mean_error[0], [0.01, -0.02, 0.03, 1e-3, 0.0, -1e-3], rtol=1e-9, atol=1e-15)
     # Without sensors and gyro noise an error matrix M turns the attitude by M ∫w dt.
     plain = replace(SCENARIO, gyro=GyroSpec(), sensors=(), motion=motion.ConstantRate(rate=[0.3, 0.0, 0.0]))
-    given = Dispersions(attitude_sigma=0.0, bias_sigma=0.0, scale_factor_sigma=1e-3, misalignment_sigma=2e-3)
-    s = lanes.run_chunk(Plan(scenario=plain, setup=SETUP, epochs=20, dispersions=given), 0, 800)
+    dispersions = Dispersions(attitude_sigma=0.0, bias_sigma=0.0, scale_factor_sigma=1e-3, misalignment_sigma=2e-3)
+    s = lanes.run_chunk(Plan(scenario=plain, setup=SETUP, epochs=20, dispersions=dispersions), 0, 800)
     # Along the axis of turning the error grows with the angle; across it comes round: |∫ R dt| = 2 sin(θ/2)/θ of that.
     angle = 0.3 * 8.0
     across = 2e-3 * 2.0 * math.sin(0.5 * angle)
@@ -173,8 +173,8 @@ def test_fixed_errors_and_dispersions():
 def test_gyro_noise_has_its_closed_form(spec, exact):
     """A filter that starts right, with no noise model and no measurement, has the gyro's errors: angle and bias, at rest."""
     still = replace(SCENARIO, gyro=spec, sensors=(), motion=motion.rest())
-    given = Dispersions(attitude_sigma=0.0, bias_sigma=0.0)
-    plan = Plan(scenario=still, setup=SETUP, epochs=20, dispersions=given)
+    dispersions = Dispersions(attitude_sigma=0.0, bias_sigma=0.0)
+    plan = Plan(scenario=still, setup=SETUP, epochs=20, dispersions=dispersions)
     group = lanes._Group(plan)
     angle, bias = [], []
     for first in range(0, 1200, 8):
@@ -232,11 +232,11 @@ def test_range_and_resolution_are_the_simulators():
     """Without noise both machines have the same record: clipped in places, rounded by axis."""
     spec = GyroSpec(range=0.3, rate_resolution=np.array([0.01, 0.0, 0.003]), turn_on_bias=[0.1, 0.2, -0.3])
     plan = replace(PLAN, scenario=replace(SCENARIO, gyro=spec))
-    found, wanted = lanes.replay(plan, 0).record.increments, scalar.record_of(plan, 0).increments
+    increments, wanted = lanes.replay(plan, 0).record.increments, scalar.record_of(plan, 0).increments
     limit = 0.3 / SCENARIO.rate
     assert np.any(np.isclose(wanted, limit, rtol=1e-9))
     assert np.any(np.isclose(wanted, -limit, rtol=1e-9))
-    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(increments, wanted, rtol=0.0, atol=1e-15)
 
 
 # ----------------------------------------------------------------------------------------------------- all kinds of sensors

@@ -106,8 +106,8 @@ MODELS = {
 def plan(name: str, **changes) -> montecarlo.Plan:
     sensors, states = MODELS[name]
     scenario = scenarios.Scenario(motion=MOTION, gyro=GYRO, sensors=sensors, rate=50.0, duration=20.0)
-    chosen = FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=1e-4, states=states)
-    return montecarlo.Plan(scenario=scenario, setup=chosen, seed=3, epochs=20, nis_bins=10, **changes)
+    filter_setup = FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=1e-4, states=states)
+    return montecarlo.Plan(scenario=scenario, setup=filter_setup, seed=3, epochs=20, nis_bins=10, **changes)
 
 
 def quick_or_slow(names) -> list:
@@ -115,24 +115,24 @@ def quick_or_slow(names) -> list:
     return [pytest.param(name, marks=[] if name == "heading" else pytest.mark.slow) for name in names]
 
 
-def assert_filtered_alike(found, chosen):
+def assert_filtered_alike(replayed, filter_setup):
     """Assert that a replayed run is what the filter of one record, another loop and layout, makes of it: to 1e-8 of σ."""
-    one = found.estimate
-    other = setup.run(found.record, chosen, found.initial, full_covariance=True)
+    estimate = replayed.estimate
+    other = setup.run(replayed.record, filter_setup, replayed.initial, full_covariance=True)
     sigma = np.sqrt(other.variance)
-    apart = consistency.errors(one.attitude, one.bias, other.attitude, other.bias) / sigma
+    apart = consistency.errors(estimate.attitude, estimate.bias, other.attitude, other.bias) / sigma
     assert np.abs(apart).max() < 1e-8
-    P = (one.covariance - other.covariance) / (sigma[:, :, None] * sigma[:, None, :])
+    P = (estimate.covariance - other.covariance) / (sigma[:, :, None] * sigma[:, None, :])
     assert np.abs(P).max() < 1e-8
-    assert np.allclose(one.variance, other.variance, rtol=1e-8, atol=0.0)
-    assert one.skipped == other.skipped
+    assert np.allclose(estimate.variance, other.variance, rtol=1e-8, atol=0.0)
+    assert estimate.skipped == other.skipped
     for sensor, innovations in other.innovations.items():
-        mine = one.innovations[sensor]
+        mine = estimate.innovations[sensor]
         assert np.array_equal(mine.time, innovations.time)
         assert np.allclose(mine.variance, innovations.variance, rtol=1e-8, atol=0.0)
         assert np.allclose(mine.nis, innovations.nis, rtol=1e-7, atol=1e-7)
     for block, state in other.error_states.items():
-        mine = one.error_states[block]
+        mine = estimate.error_states[block]
         assert np.abs((mine.values - state.values) / np.sqrt(state.variance)).max() < 1e-8
         assert np.allclose(mine.variance, state.variance, rtol=1e-8, atol=0.0)
 
@@ -140,31 +140,31 @@ def assert_filtered_alike(found, chosen):
 @pytest.mark.parametrize("name", quick_or_slow(MODELS))
 def test_each_run_is_what_the_filter_alone_makes_of_it(name):
     """Errors, σ, correlations, NIS and error states; also where the first measurements are far more precise than the state."""
-    one = plan(name)
-    assert montecarlo.choose(one).machine == "lanes"
-    vague = replace(one, setup=replace(one.setup, attitude_sigma=0.3))
+    model_plan = plan(name)
+    assert montecarlo.choose(model_plan).machine == "lanes"
+    vague = replace(model_plan, setup=replace(model_plan.setup, attitude_sigma=0.3))
     for run in (0, 5):
-        assert_filtered_alike(montecarlo.replay(one, run), one.setup)
+        assert_filtered_alike(montecarlo.replay(model_plan, run), model_plan.setup)
         assert_filtered_alike(montecarlo.replay(vague, run), vague.setup)
 
 
 @pytest.mark.parametrize("name", quick_or_slow(["whole vectors", "heading"]))
 def test_the_units_of_the_runs_are_those_of_the_simulator(name):
     """Without noise a run has the same gyro and sensors on both machines: error matrix, force, hard iron, lever arm."""
-    one = plan(
+    model_plan = plan(
         name, individuals=True, dispersions=montecarlo.Dispersions(scale_factor_sigma=1e-3, turn_on_bias_sigma=1e-4)
     )
     gyro = replace(GYRO, angle_random_walk=0.0, rate_random_walk=0.0, bias_instability=0.0)
-    sensors = tuple(replace(sensor, sigma=1e-9, faults=vectors.Faults()) for sensor in one.scenario.sensors)
+    sensors = tuple(replace(sensor, sigma=1e-9, faults=vectors.Faults()) for sensor in model_plan.scenario.sensors)
     sigma = {sensor.name: 0.01 for sensor in sensors}
-    one = replace(
-        one,
-        scenario=replace(one.scenario, gyro=gyro, sensors=sensors),
-        setup=replace(one.setup, sigma=sigma, states=plan(name).setup.states),
+    model_plan = replace(
+        model_plan,
+        scenario=replace(model_plan.scenario, gyro=gyro, sensors=sensors),
+        setup=replace(model_plan.setup, sigma=sigma, states=plan(name).setup.states),
     )
     for run in (0, 11):
-        fast, slow = montecarlo.replay(one, run).record, scalar.record_of(one, run)
-        assert not np.allclose(fast.increments, scalar.record_of(one, run + 1).increments, atol=1e-7)
+        fast, slow = montecarlo.replay(model_plan, run).record, scalar.record_of(model_plan, run)
+        assert not np.allclose(fast.increments, scalar.record_of(model_plan, run + 1).increments, atol=1e-7)
         assert np.allclose(fast.increments, slow.increments, rtol=0.0, atol=1e-12)
         assert np.allclose(fast.truth.bias, slow.truth.bias, rtol=0.0, atol=1e-12)
         for mine, series in zip(fast.vectors, slow.vectors, strict=True):
@@ -173,29 +173,29 @@ def test_the_units_of_the_runs_are_those_of_the_simulator(name):
 
 @pytest.mark.parametrize("name", quick_or_slow(["gyro, star tracker", "heading"]))
 def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
-    one = plan(name, individuals=True)
-    whole = lanes.run_chunk(one, 0, 8)
+    model_plan = plan(name, individuals=True)
+    whole = lanes.run_chunk(model_plan, 0, 8)
     for first in range(1, 8):
-        part = lanes.run_chunk(one, first, 9)
+        part = lanes.run_chunk(model_plan, first, 9)
         count = 8 - first
         assert np.array_equal(part.example_error[:count], whole.example_error[first:])
         assert np.array_equal(part.example_sigma[:count], whole.example_sigma[first:])
 
 
 def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run():
-    one = plan("heading", individuals=True)
-    whole = montecarlo.run_plan(one, runs=20, chunk=20, threads=1)
+    model_plan = plan("heading", individuals=True)
+    whole = montecarlo.run_plan(model_plan, runs=20, chunk=20, threads=1)
     for chunk, threads in ((8, 2), (3, 1)):
-        other = montecarlo.run_plan(one, runs=20, chunk=chunk, threads=threads)
+        other = montecarlo.run_plan(model_plan, runs=20, chunk=chunk, threads=threads)
         exact = ["finite", "coverage", "histogram", "worst_run", "worst_score"]
         assert not different(whole, other, [*exact, "example_run", "example_error", "example_sigma"])
-    again = montecarlo.run_plan(one, runs=20, chunk=20, threads=2)
+    again = montecarlo.run_plan(model_plan, runs=20, chunk=20, threads=2)
     assert_same(whole, again)
     for run in (0, 5):
-        found = montecarlo.replay(one, run)
-        rows = slice(None, None, one.every)
-        assert np.array_equal(errors_at(found.estimate, found.record.truth, rows), whole.example_error[run])
-        assert np.array_equal(np.sqrt(found.estimate.variance[rows]), whole.example_sigma[run])
+        replayed = montecarlo.replay(model_plan, run)
+        rows = slice(None, None, model_plan.every)
+        assert np.array_equal(errors_at(replayed.estimate, replayed.record.truth, rows), whole.example_error[run])
+        assert np.array_equal(np.sqrt(replayed.estimate.variance[rows]), whole.example_sigma[run])
 
 
 @pytest.mark.slow
@@ -204,8 +204,10 @@ def test_the_filter_with_states_is_as_good_as_it_says():
     scenario = replace(plan("heading").scenario, duration=10.0)
     verdicts = []
     for states in (True, False):
-        chosen = setup.FilterSetup.for_scenario(scenario, states=states)
-        one = montecarlo.Plan(scenario=scenario, setup=chosen, seed=8, epochs=10, nis_bins=5, individuals=True)
-        verdicts.append(montecarlo.run_plan(one, runs=96, machine="lanes").verdict(np.arange(2, 11, 2), "state"))
+        filter_setup = setup.FilterSetup.for_scenario(scenario, states=states)
+        model_plan = montecarlo.Plan(
+            scenario=scenario, setup=filter_setup, seed=8, epochs=10, nis_bins=5, individuals=True
+        )
+        verdicts.append(montecarlo.run_plan(model_plan, runs=96, machine="lanes").verdict(np.arange(2, 11, 2), "state"))
     assert verdicts[0].consistent, verdicts[0].mean
     assert not verdicts[1].consistent

@@ -60,14 +60,14 @@ def test_quantiles_are_those_of_the_sample(probability):
 
 
 def test_quantiles_at_the_ends():
-    one = scalar.run_chunk(PLAN, 0, 20)
-    least, most = one.error_quantile(0.0), one.error_quantile(1.0)
+    sums = scalar.run_chunk(PLAN, 0, 20)
+    least, most = sums.error_quantile(0.0), sums.error_quantile(1.0)
     assert np.all(least <= most)
-    assert np.all(most >= one.rms_error)
-    empty = replace(one, histogram=np.zeros_like(one.histogram))
+    assert np.all(most >= sums.rms_error)
+    empty = replace(sums, histogram=np.zeros_like(sums.histogram))
     assert np.isnan(empty.error_quantile(0.5)).all()
     with pytest.raises(InputError, match="between 0 and 1"):
-        one.error_quantile(1.5)
+        sums.error_quantile(1.5)
 
 
 # ------------------------------------------------------------------------------------------------------------ sums
@@ -110,8 +110,8 @@ def test_every_sum_is_what_its_definition_says():
             kept[run, k] = e, np.sqrt(np.diag(P))
         score[run] = peak
         for i, name in enumerate(PLAN.sensors):
-            seen = estimate.innovations[name]
-            for t, value in zip(seen.time, seen.nis, strict=True):
+            innovations = estimate.innovations[name]
+            for t, value in zip(innovations.time, innovations.nis, strict=True):
                 span = max(0, math.ceil(t / 2.4 * PLAN.nis_bins - 1e-9) - 1)  # one on an edge belongs to what it ends
                 nis[i, span] += value
                 degrees[i, span] += 2
@@ -186,13 +186,13 @@ def test_a_run_that_fails_is_counted_reported_and_left_out(monkeypatch):
 
     def failing(record, setup, initial, **options):
         estimate = original(record, setup, initial, **options)
-        if initial.attitude[0] == chosen[0]:
+        if initial.attitude[0] == start[0]:
             estimate.attitude[3:] = np.nan
             estimate.covariance[5:] = -estimate.covariance[5:]
         return estimate
 
     record = scenarios.simulate(SCENARIO, PLAN.seed, 2)
-    chosen = montecarlo.start(record, SETUP, PLAN.seed, 2).attitude
+    start = montecarlo.start(record, SETUP, PLAN.seed, 2).attitude
     good = montecarlo.merge(scalar.run_chunk(PLAN, 0, 2), scalar.run_chunk(PLAN, 3, 2))
     monkeypatch.setattr(setups, "run", failing)
     total = scalar.run_chunk(PLAN, 0, 5)
@@ -255,7 +255,7 @@ def test_summary_bounds_are_those_that_decide():
     summary = montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)
     judgement = sums.judge(epochs=epochs, confidence_level=0.95)
     assert len(judgement.findings) == 10
-    assert not any(one.rejected for one in judgement.findings)
+    assert not any(finding.rejected for finding in judgement.findings)
     single = 0.05 / 10.0
     low, high = scipy.stats.chi2.ppf([0.25 * single, 1.0 - 0.25 * single], 9) / 9.0
     assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
@@ -272,15 +272,20 @@ def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
     error = sums.example_error + 3.0 * sums.rms_error * (np.arange(6) == 5)
     moved = {"error_sum": error.sum(axis=0), "error_product_sum": np.einsum("rmi,rmj->mij", error, error)}
     logs = sums.log_nees_sum + 2.4 * np.arange(7)[:, None]
-    found = {one.name: one for one in replace(sums, **moved, log_nees_sum=logs).judge(epochs=epochs).findings}
+    findings = {
+        finding.name: finding for finding in replace(sums, **moved, log_nees_sum=logs).judge(epochs=epochs).findings
+    }
     student = scipy.stats.ttest_1samp(error[:, epochs], 0.0)
-    assert (found["mean error"].of, found["mean error"].value) == ("bias z", pytest.approx(student.statistic.max()))
-    assert found["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
+    assert (findings["mean error"].of, findings["mean error"].value) == (
+        "bias z",
+        pytest.approx(student.statistic.max()),
+    )
+    assert findings["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
     anees = sums.nees_sum[epochs, 2]
-    each = [2.0 * min(scipy.stats.chi2.cdf(one, 24), scipy.stats.chi2.sf(one, 24)) for one in anees]
-    assert found["ANEES"].p_value == pytest.approx(min(1.0, 2.0 * min(each)))
+    each = [2.0 * min(scipy.stats.chi2.cdf(value, 24), scipy.stats.chi2.sf(value, 24)) for value in anees]
+    assert findings["ANEES"].p_value == pytest.approx(min(1.0, 2.0 * min(each)))
     p = consistency.log_mean_p_value(float(logs[4, 2]) / 8.0, 3, 8)
-    assert found["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
+    assert findings["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
 
 
 def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
@@ -294,12 +299,16 @@ def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
     nees[4] = 18.0 * 50.0, 9.0 * 0.9 * low, 9.0 * 50.0
     odd = replace(sums, nees_sum=nees, sensor_nis_sum=50.0 * sums.sensor_nis_sum, log_nees_sum=sums.log_nees_sum + 30.0)
     summary = montecarlo.summary(odd, epochs=epochs, confidence_level=0.95)
-    found = {one.of: one for one in odd.judge(epochs=epochs, confidence_level=0.95).findings if one.name == "ANEES"}
-    assert found["attitude"].rejected
+    findings = {
+        finding.of: finding
+        for finding in odd.judge(epochs=epochs, confidence_level=0.95).findings
+        if finding.name == "ANEES"
+    }
+    assert findings["attitude"].rejected
     for subset, part in summary["nees"].items():
-        assert part["consistent"] == (not found[subset].rejected)
-        assert part["bounds"] == [found[subset].low, found[subset].high]
-        assert part["epochs_outside"] == int(found[subset].rejected)
+        assert part["consistent"] == (not findings[subset].rejected)
+        assert part["bounds"] == [findings[subset].low, findings[subset].high]
+        assert part["epochs_outside"] == int(findings[subset].rejected)
 
 
 def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
@@ -307,7 +316,7 @@ def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
     refused = np.arange(10).reshape(2, 5)
     bound = np.tile(np.diag([4.0, 1.0, 1.0, 1.0, 1.0, 1.0]), (7, 1, 1))
     summary = montecarlo.summary(replace(sums, sensor_refused=refused), bound=bound, epochs=np.array([2, 4]))
-    assert [one["refused"] for one in summary["nis"]] == [10, 35]
+    assert [sensor["refused"] for sensor in summary["nis"]] == [10, 35]
     median = sums.error_quantile(0.5)[-1] * 648000.0 / np.pi
     np.testing.assert_allclose(summary["last_epoch"]["attitude_error_quantile_0.5_arcsec"], median[:3])
     over = summary["rms_over_root_cramer_rao_bound"]
@@ -319,20 +328,20 @@ def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
 
 def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs():
     sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4, 6])
-    found = FilterOutcome(integration="a", statistics=sums, epochs=epochs).summary()
+    summary = FilterOutcome(integration="a", statistics=sums, epochs=epochs).summary()
     error, P = sums.example_error[:, epochs], sums.covariance_sum[epochs] / 8.0
     turn = np.pi / 648000.0  # an arcsecond, and a degree per hour
     for name, part in (("attitude_{}_arcsec", slice(3)), ("bias_{}_deg_per_hour", slice(3, 6))):
-        assert found[name.format("rms")] * turn == pytest.approx(np.sqrt(np.mean(error[:, :, part] ** 2)))
+        assert summary[name.format("rms")] * turn == pytest.approx(np.sqrt(np.mean(error[:, :, part] ** 2)))
         sigma = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2)[:, part]))
-        assert found[name.format("sigma")] * turn == pytest.approx(sigma)
-    np.testing.assert_allclose(np.multiply(found["bias_mean_deg_per_hour"], turn), error[:, :, 3:].mean(axis=(0, 1)))
+        assert summary[name.format("sigma")] * turn == pytest.approx(sigma)
+    np.testing.assert_allclose(np.multiply(summary["bias_mean_deg_per_hour"], turn), error[:, :, 3:].mean(axis=(0, 1)))
     totals = {"anees": (6 * 8, sums.nees_sum[epochs, 0]), "anees_bias": (3 * 8, sums.nees_sum[epochs, 2])}
     totals |= {"nis": (sums.sensor_degrees.sum(), sums.sensor_nis_sum.sum())}
     for name, (degrees, total) in totals.items():
-        assert found[name] == pytest.approx(np.mean(total) / degrees)
+        assert summary[name] == pytest.approx(np.mean(total) / degrees)
         ends = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
-        np.testing.assert_allclose(found[f"{name}_bounds"], ends)
+        np.testing.assert_allclose(summary[f"{name}_bounds"], ends)
 
 
 def test_summary_takes_coverage_over_the_judged_epochs():
@@ -358,12 +367,12 @@ DISPERSED = montecarlo.Dispersions(
 
 def test_a_plan_goes_through_its_table_and_back():
     plans = (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3})))
-    for one in (*plans, planned(individuals=True)):
-        again = plan.from_table(one.to_table())
-        assert again.to_table() == one.to_table()
-        assert again.digest == one.digest
-        assert again.individuals == one.individuals
-        assert not different(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
+    for original in (*plans, planned(individuals=True)):
+        again = plan.from_table(original.to_table())
+        assert again.to_table() == original.to_table()
+        assert again.digest == original.digest
+        assert again.individuals == original.individuals
+        assert not different(scalar.run_chunk(original, 0, 2), scalar.run_chunk(again, 0, 2))
 
 
 def test_every_part_of_a_plan_counts_in_its_digest():
@@ -375,7 +384,7 @@ def test_every_part_of_a_plan_counts_in_its_digest():
         planned(setup=replace(SETUP, bias_sigma=2.0 * SETUP.bias_sigma)),
         planned(scenario=replace(SCENARIO, duration=4.8)),
     ]
-    digests = {one.digest for one in (PLAN, *others)}
+    digests = {variant.digest for variant in (PLAN, *others)}
     assert len(digests) == len(others) + 1
     assert planned().digest == PLAN.digest
 
@@ -406,9 +415,9 @@ def test_bad_dispersions_are_refused(tmp_path):
     with pytest.raises(InputError, match="scale_factor_sigma_ppm"):
         montecarlo.read_dispersions(path)
     path.write_text("[dispersions]\nscale_factor_sigma_ppm = 300.0\nattitude_error_deg = [0.0, 0.0, 20.0]\n")
-    found = montecarlo.read_dispersions(path)
-    assert found.scale_factor_sigma == pytest.approx(3e-4, rel=1e-15)
-    assert found.attitude_error[2] == pytest.approx(math.radians(20.0))
+    dispersions = montecarlo.read_dispersions(path)
+    assert dispersions.scale_factor_sigma == pytest.approx(3e-4, rel=1e-15)
+    assert dispersions.attitude_error[2] == pytest.approx(math.radians(20.0))
 
 
 def test_whole_epochs_cut_into_whole_steps():
@@ -449,11 +458,11 @@ def test_a_dispersed_gyro_is_the_one_that_is_simulated():
 
 def test_initial_errors_are_as_dispersed():
     """e at the start is the fixed part plus σ times the draw, to first order of the angle."""
-    given = montecarlo.Dispersions(
+    dispersions = montecarlo.Dispersions(
         attitude_sigma=0.0, bias_sigma=1e-3, attitude_error=np.array([0.3, -0.2, 0.1]), bias_error=np.full(3, 5e-3)
     )
-    total = montecarlo.run_plan(planned(dispersions=given), runs=200, machine="scalar")
-    assert np.allclose(total.mean_error[0, :3], given.attitude_error, atol=1e-12)
+    total = montecarlo.run_plan(planned(dispersions=dispersions), runs=200, machine="scalar")
+    assert np.allclose(total.mean_error[0, :3], dispersions.attitude_error, atol=1e-12)
     assert np.all(np.abs(total.mean_error[0, 3:] - 5e-3) < 4.0 * 1e-3 / np.sqrt(200))
     spread = np.diagonal(total.mean_square_error[0])[3:] - total.mean_error[0, 3:] ** 2
     assert np.all(np.abs(spread / 1e-6 - 1.0) < 4.5 * np.sqrt(2.0 / 200))
@@ -473,11 +482,11 @@ COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_r
 )
 def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size_on_any_number_of_threads(machine, others):
     """Every run counts, and the worst and the first ones in all their bits; in chunks of the same size all sums too."""
-    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine=machine)
+    reference = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine=machine)
     for chunk, threads in others:
         other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine=machine)
-        assert not different(one, other, COUNTED if chunk != 8 else None)
-        assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
+        assert not different(reference, other, COUNTED if chunk != 8 else None)
+        assert np.allclose(reference.nees_sum, other.nees_sum, rtol=1e-12)
 
 
 def test_several_filters_see_the_same_sensors():
@@ -485,8 +494,8 @@ def test_several_filters_see_the_same_sensors():
     setups_ = (SETUP, replace(SETUP, measurement_sigma_factor=2.0))
     options = {"runs": 12, "seed": 4, "epochs": 6, "nis_bins": 5}
     together = montecarlo.run(SCENARIO, setups_, **options)
-    for one, found in zip(setups_, together, strict=True):
-        assert not different(found, montecarlo.run_plan(planned(setup=one), runs=12, machine="scalar"))
+    for filter_setup, sums in zip(setups_, together, strict=True):
+        assert not different(sums, montecarlo.run_plan(planned(setup=filter_setup), runs=12, machine="scalar"))
 
 
 def test_memory_does_not_grow_with_the_runs():
@@ -531,13 +540,13 @@ def test_no_chunk_is_begun_far_ahead_of_the_first_unfinished_one():
 
 
 def test_chunks_that_finish_out_of_order_are_merged_in_order():
-    one = montecarlo.run_plan(PLAN, runs=30, chunk=5, threads=1, machine="scalar")
+    sums = montecarlo.run_plan(PLAN, runs=30, chunk=5, threads=1, machine="scalar")
 
     def backwards(work, chunks):
         for place in reversed(range(len(chunks))):
             yield place, work(*chunks[place])
 
-    assert not different(one, montecarlo.run_plan(PLAN, runs=30, chunk=5, machine="scalar", workers=backwards))
+    assert not different(sums, montecarlo.run_plan(PLAN, runs=30, chunk=5, machine="scalar", workers=backwards))
 
 
 def test_an_error_in_a_thread_comes_out_and_ends_the_others():
@@ -589,9 +598,9 @@ def test_bad_numbers_are_refused(options, message):
 
 def test_the_machine_is_chosen_by_the_plan_and_reported():
     rough = planned(scenario=replace(SCENARIO, gyro=replace(SCENARIO.gyro, quantization=1e-6)))
-    chosen = montecarlo.choose(rough)
-    assert chosen.machine == "scalar"
-    assert "quantization" in str(chosen)
+    choice = montecarlo.choose(rough)
+    assert choice.machine == "scalar"
+    assert "quantization" in str(choice)
     assert montecarlo.choose(PLAN, "scalar").machine == "scalar"
     with pytest.raises(InputError, match=r"lanes .*quantization"):
         montecarlo.choose(rough, "lanes")
@@ -610,19 +619,19 @@ def test_the_examples_are_the_first_runs_by_their_numbers(machine):
 def test_degrees_of_freedom_are_those_of_the_states_judged():
     total = scalar.run_chunk(PLAN, 0, 8)
     epochs = np.array([2, 4])
-    found = {name: total.verdict(epochs, name).degrees for name in total.subsets}
-    assert found == {"state": 6, "attitude": 3, "bias": 3}
+    degrees = {name: total.verdict(epochs, name).degrees for name in total.subsets}
+    assert degrees == {"state": 6, "attitude": 3, "bias": 3}
 
 
 def test_lost_samples_and_jitter_go_through_too():
     """Epochs stay at their times, whatever samples were lost before them."""
     spec = replace(SCENARIO.gyro, drop_probability=0.2, sampling_jitter=1e-4)
-    one = planned(scenario=replace(SCENARIO, gyro=spec))
-    total = scalar.run_chunk(one, 0, 5)
+    lossy = planned(scenario=replace(SCENARIO, gyro=spec))
+    total = scalar.run_chunk(lossy, 0, 5)
     assert total.finite.tolist() == [5] * 7
-    again = montecarlo.replay(one, 3, machine="scalar")
+    again = montecarlo.replay(lossy, 3, machine="scalar")
     assert len(again.record.increments) < 240
-    rows = np.searchsorted(again.estimate.time, one.time + 1e-6, side="right") - 1
+    rows = np.searchsorted(again.estimate.time, lossy.time + 1e-6, side="right") - 1
     assert np.array_equal(errors_at(again.estimate, again.record.truth, rows), total.example_error[3])
 
 

@@ -458,9 +458,9 @@ def test_torque_free_after_a_hundred_thousand_periods(name):
         period = 4 * m.ellipk(k2) / p
 
         def spin(t):
-            one = outer / (i1 * (i3 - i1)) * m.ellipfun("cn", p * t, m=k2).real ** 2
-            two = outer / (i2 * (i3 - i2)) * m.ellipfun("sn", p * t, m=k2).real ** 2
-            return momentum * (i1 * one + i2 * two) / (i1**2 * one + i2**2 * two)
+            first = outer / (i1 * (i3 - i1)) * m.ellipfun("cn", p * t, m=k2).real ** 2
+            second = outer / (i2 * (i3 - i2)) * m.ellipfun("sn", p * t, m=k2).real ** 2
+            return momentum * (i1 * first + i2 * second) / (i1**2 * first + i2**2 * second)
 
         # Periodic and analytic: equal weights converge geometrically.
         advance = period * sum(spin(period * j / 240) for j in range(120)) / 120
@@ -566,7 +566,7 @@ def test_harmonic_attitude_against_mpmath():
         def change(t, q):
             w, (x, y, z), (a, b, c) = q[0], q[1:], rate(t)
             twice = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-            return [one / 2 for one in twice]
+            return [component / 2 for component in twice]
 
         exact = mpmath.odefun(change, 0, [mpmath.mpf(x) for x in START], tol=mpmath.mpf(10) ** -19)(0.25)
     assert np.abs(truth.attitude(0.25) - np.array([float(x) for x in exact])).max() < 5e-16

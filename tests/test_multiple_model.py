@@ -49,10 +49,10 @@ def orbit(run, *, duration=1500.0, seed=11, **changes):
     return scenarios.simulate(scenario, seed, run), belief
 
 
-def judged(found, record):
-    truth = Truth(attitude=record.truth.attitude[found.edges], bias=record.truth.bias[found.edges])
-    e = errors(found.estimate, truth)
-    return e, consistency.nees(e, found.estimate.covariance)
+def judged(bank, record):
+    truth = Truth(attitude=record.truth.attitude[bank.edges], bias=record.truth.bias[bank.edges])
+    e = errors(bank.estimate, truth)
+    return e, consistency.nees(e, bank.estimate.covariance)
 
 
 def tracker(time, attitude, sigma):
@@ -67,15 +67,15 @@ def tracker(time, attitude, sigma):
     )
 
 
-def goes_on(found, row, record, process, **options):
+def goes_on(bank, row, record, process, **options):
     """The filter alone from a row of the bank on, over what the record holds after it."""
-    estimate, edge = found.estimate, int(np.searchsorted(record.time, found.estimate.time[row]))
-    one = estimation.State(
+    estimate, edge = bank.estimate, int(np.searchsorted(record.time, bank.estimate.time[row]))
+    start = estimation.State(
         attitude=estimate.attitude[row], bias=estimate.bias[row], covariance=estimate.covariance[row]
     )
     rest = records.cut(record, edge, len(record.time) - 1)
     rest = dataclasses.replace(rest, vectors=tuple(s.taken(s.time > record.time[edge]) for s in rest.vectors))
-    return estimation.run(rest, process, one, full_covariance=True, **options)
+    return estimation.run(rest, process, start, full_covariance=True, **options)
 
 
 # ------------------------------------------------------------------------------------------------------------------ the circle
@@ -222,19 +222,19 @@ def test_for_small_errors_it_is_the_plain_filter():
 def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bias_sigma, monkeypatch):
     """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
     time = 0.3 * np.arange(21)
-    seen = np.concatenate([[0.05, 0.1], time[2:]])
+    stamps = np.concatenate([[0.05, 0.1], time[2:]])
     # The second attitude is nearly half a turn off: where little is known of the bias, the bias is blamed.
-    attitude = quaternion.exp(np.where(seen == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
-    series = tracker(seen, attitude, 1e-2)
+    attitude = quaternion.exp(np.where(stamps == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
+    series = tracker(stamps, attitude, 1e-2)
     record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(series,))
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3)
     # One hypothesis, reported at the end of the record.
-    found = multiple_model.run(record, noise, bias_sigma=bias_sigma, every=20)
+    bank = multiple_model.run(record, noise, bias_sigma=bias_sigma, every=20)
     start = estimation.initial_state(attitude[0], attitude_sigma=1e-2, bias_sigma=bias_sigma)
     increments = record.increments.copy()
     increments[0] *= 0.25 / 0.3
-    edges = np.concatenate([seen[:1], time[1:]])
-    rest = ImuRecord(time=edges, increments=increments, vectors=(series.taken(seen > seen[0]),))
+    edges = np.concatenate([stamps[:1], time[1:]])
+    rest = ImuRecord(time=edges, increments=increments, vectors=(series.taken(stamps > stamps[0]),))
     # A gate that accepts everything, in a filter that relinearises its updates as after a recovery.
     monkeypatch.setattr(Gate, "thresholds", np.full(3, np.inf))
     counts = np.zeros(gate_rules.MEMORY)
@@ -242,9 +242,9 @@ def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bia
     start = dataclasses.replace(start, gate=GateMemory(restart_bias_variance=np.ones(3), counts=counts, counters={}))
     single = estimation.run(rest, noise, start, full_covariance=True, gate=Gate(recovery=None))
     assert (np.abs(single.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
-    np.testing.assert_allclose(found.estimate.innovations["tracker"].nis, single.innovations["tracker"].nis, rtol=1e-7)
-    np.testing.assert_allclose(found.estimate.bias[-1], single.bias[-1], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(found.estimate.covariance[-1], single.covariance[-1], rtol=1e-7, atol=1e-15)
+    np.testing.assert_allclose(bank.estimate.innovations["tracker"].nis, single.innovations["tracker"].nis, rtol=1e-7)
+    np.testing.assert_allclose(bank.estimate.bias[-1], single.bias[-1], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(bank.estimate.covariance[-1], single.covariance[-1], rtol=1e-7, atol=1e-15)
 
 
 def test_weights_are_the_densities_of_the_measurement():
@@ -266,18 +266,18 @@ def starts(runs, hypotheses, **options):
     outcomes = []
     for run in range(runs):
         record, belief = orbit(run, **options)
-        found = multiple_model.run(record, belief, hypotheses=hypotheses, every=10)
-        outcomes.append((found, *judged(found, record)))
+        bank = multiple_model.run(record, belief, hypotheses=hypotheses, every=10)
+        outcomes.append((bank, *judged(bank, record)))
     return outcomes
 
 
 def check_starts(outcomes, epochs):
     runs = len(outcomes)
     time = outcomes[0][0].estimate.time
-    one = np.array([found.became_one for found, _, _ in outcomes])
-    assert np.median(one) < 500.0
-    assert np.mean(np.isfinite(one)) > 0.9
-    assert all(found.converged == (not found.reason) for found, _, _ in outcomes)
+    settled = np.array([bank.became_one for bank, _, _ in outcomes])
+    assert np.median(settled) < 500.0
+    assert np.mean(np.isfinite(settled)) > 0.9
+    assert all(bank.converged == (not bank.reason) for bank, _, _ in outcomes)
     last = np.array([np.linalg.norm(e[-1, :3]) for _, e, _ in outcomes])
     assert last.max() < 1.0 * DEGREE
     for seconds in epochs:
@@ -286,9 +286,9 @@ def check_starts(outcomes, epochs):
         low, high = consistency.mean_bounds(6, runs, 1.0 - 0.01 / len(epochs))
         assert low < mean < high, f"{mean:.3f} at {seconds} s, bounds {low:.3f} to {high:.3f}"
     total, number = 0.0, 0
-    for found, _, _ in outcomes:  # until they are one, the innovations are those of one hypothesis of many
-        innovations = found.estimate.innovations["magnetometer"]
-        after = innovations.time > found.became_one
+    for bank, _, _ in outcomes:  # until they are one, the innovations are those of one hypothesis of many
+        innovations = bank.estimate.innovations["magnetometer"]
+        after = innovations.time > bank.became_one
         total, number = total + innovations.nis[after].sum(), number + innovations.innovation[after].size
     assert_inside(total / number, 1, number)
 
@@ -302,19 +302,19 @@ def test_from_a_thousand_starts_over_an_orbit_and_a_half():
     outcomes = starts(1000, multiple_model.HYPOTHESES, duration=9000.0)
     check_starts(outcomes, (60.0, 200.0, 400.0, 800.0, 1500.0, 3000.0, 6000.0, 8990.0))
     hours = []
-    for found, e, _ in outcomes:
+    for bank, e, _ in outcomes:
         above = np.flatnonzero(np.linalg.norm(e[:, :3], axis=1) > 1.0 * DEGREE)
-        hours.append(found.estimate.time[above[-1] + 1] / 3600.0)
+        hours.append(bank.estimate.time[above[-1] + 1] / 3600.0)
     assert np.quantile(hours, 0.99) < 0.2  # what the study found a bank of 24 to take
 
 
 def test_before_it_is_one_its_gaussian_is_no_narrower_than_the_mixture():
     record, belief = orbit(2, duration=300.0)
-    found = multiple_model.run(record, belief)
-    P = found.estimate.covariance
+    bank = multiple_model.run(record, belief)
+    P = bank.estimate.covariance
     assert np.sqrt(np.linalg.eigvalsh(P[0, :3, :3])[-1]) == pytest.approx(np.pi / np.sqrt(3.0), rel=0.03)  # uniform
-    assert np.allclose(found.weights[0], 1.0 / multiple_model.HYPOTHESES)
-    assert np.allclose(found.weights.sum(axis=1), 1.0)
+    assert np.allclose(bank.weights[0], 1.0 / multiple_model.HYPOTHESES)
+    assert np.allclose(bank.weights.sum(axis=1), 1.0)
 
 
 @pytest.mark.parametrize("rate", [np.zeros(3), np.array([0.02, -0.01, 0.03])])
@@ -324,25 +324,25 @@ def test_a_constant_reference_leaves_the_turn_about_it_open_and_it_says_so(rate)
     sensor = dataclasses.replace(scenario.sensors[0], field_f=field, rate=1.0)
     scenario = dataclasses.replace(scenario, sensors=(sensor,), motion=ConstantRate(rate=rate), duration=600.0)
     record = scenarios.simulate(scenario, 4)
-    found = multiple_model.run(record, ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-8), hypotheses=24)
-    assert not found.converged
-    assert np.sum(found.weights[-1] > 0.0) == 24
-    assert found.became_one == np.inf
-    assert "cannot be observed" in found.reason
-    assert "(+0.71, -0.00, +0.71)" in found.reason or "(+0.71, +0.00, +0.71)" in found.reason
-    assert np.allclose(found.weights[-1], 1.0 / 24, atol=1e-6)
-    widest = np.sqrt(np.linalg.eigvalsh(found.estimate.covariance[:, :3, :3])[:, -1])
+    bank = multiple_model.run(record, ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-8), hypotheses=24)
+    assert not bank.converged
+    assert np.sum(bank.weights[-1] > 0.0) == 24
+    assert bank.became_one == np.inf
+    assert "cannot be observed" in bank.reason
+    assert "(+0.71, -0.00, +0.71)" in bank.reason or "(+0.71, +0.00, +0.71)" in bank.reason
+    assert np.allclose(bank.weights[-1], 1.0 / 24, atol=1e-6)
+    widest = np.sqrt(np.linalg.eigvalsh(bank.estimate.covariance[:, :3, :3])[:, -1])
     assert np.all(widest >= widest[0] * (1.0 - 1e-6))  # nothing is learnt that cannot be known
-    e, _ = judged(found, record)
-    across = quaternion.rotate(record.truth.attitude[found.edges], e[:, :3])
+    e, _ = judged(bank, record)
+    across = quaternion.rotate(record.truth.attitude[bank.edges], e[:, :3])
     assert np.linalg.norm(np.cross(across, field / np.linalg.norm(field))[-1]) < 0.02  # all but the turn is known
 
 
 def test_a_reference_that_turned_too_little_is_reported():
     record, belief = orbit(5, duration=60.0)
-    found = multiple_model.run(record, belief, hypotheses=48)
-    assert not found.converged
-    assert "record longer" in found.reason
+    bank = multiple_model.run(record, belief, hypotheses=48)
+    assert not bank.converged
+    assert "record longer" in bank.reason
 
 
 @pytest.mark.parametrize("phases", [(0.0, 0.0, 0.0), (0.0, 0.3, 0.7)])
@@ -353,18 +353,18 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
     for _ in range(25):
         q = quaternion.normalize(random.standard_normal(4))
         record = still(q, references, sigma, random, seconds=2, phases=phases)
-        found = multiple_model.run(record, QUIET, bias_sigma=1e-9)
+        bank = multiple_model.run(record, QUIET, bias_sigma=1e-9)
         row = 0 if phases[1] == 0.0 else 1  # the first edge after all three have measured once
-        used = [one.vector_b[0] for one in record.vectors]
+        used = [series.vector_b[0] for series in record.vectors]
         r = references
         if row == 1:  # the first sensor measures at that edge again
             used, r = [*used, record.vectors[0].vector_b[1]], np.concatenate([references, references[:1]])
         solution = wahba.solve(np.array(used), r, sigma)
-        apart = turn_to(solution.attitude, found.estimate.attitude[row])
+        apart = turn_to(solution.attitude, bank.estimate.attitude[row])
         root = np.linalg.cholesky(solution.covariance)
         assert np.linalg.norm(np.linalg.solve(root, apart)) < 0.05
-        assert np.allclose(found.estimate.covariance[row, :3, :3], solution.covariance, rtol=0.05, atol=0.05 * sigma**2)
-        assert found.converged
+        assert np.allclose(bank.estimate.covariance[row, :3, :3], solution.covariance, rtol=0.05, atol=0.05 * sigma**2)
+        assert bank.converged
 
 
 # ---------------------------------------------------------------------------------------------------------------- from one to the next
@@ -381,16 +381,16 @@ def test_compiled_and_plain_are_the_same(monkeypatch):
 
 def test_it_goes_on_as_the_filter_once_it_is_one():
     record, belief = orbit(3)
-    found = multiple_model.run(record, belief, every=10)
-    assert found.converged
-    k = int(np.searchsorted(found.estimate.time, found.became_one))
-    assert found.estimate.time[k] == found.became_one
-    assert len(found.weights) == k + 1
-    assert found.estimate.time[-1] == record.time[-1]
-    single = goes_on(found, k, record, belief, every=10)
-    assert np.array_equal(single.attitude, found.estimate.attitude[k:])
+    bank = multiple_model.run(record, belief, every=10)
+    assert bank.converged
+    k = int(np.searchsorted(bank.estimate.time, bank.became_one))
+    assert bank.estimate.time[k] == bank.became_one
+    assert len(bank.weights) == k + 1
+    assert bank.estimate.time[-1] == record.time[-1]
+    single = goes_on(bank, k, record, belief, every=10)
+    assert np.array_equal(single.attitude, bank.estimate.attitude[k:])
     # The first measurement made the hypotheses.
-    assert np.array_equal(found.estimate.innovations["magnetometer"].time, record.vectors[0].time[1:])
+    assert np.array_equal(bank.estimate.innovations["magnetometer"].time, record.vectors[0].time[1:])
 
 
 # --------------------------------------------------------------------------------------------------------------------- the rim
@@ -398,11 +398,15 @@ def test_it_goes_on_as_the_filter_once_it_is_one():
 
 def test_whole_vectors_count_by_their_direction():
     record, belief = orbit(6, duration=600.0)
-    one = record.vectors[0]
-    field = scenarios.load_scenario("magnetometer-only").sensors[0].field_f(one.time)
+    series = record.vectors[0]
+    field = scenarios.load_scenario("magnetometer-only").sensors[0].field_f(series.time)
     length = np.linalg.norm(field, axis=1)
     whole = dataclasses.replace(
-        one, kind="vector", vector_b=one.vector_b * length[:, None], reference_f=field, sigma=one.sigma * length
+        series,
+        kind="vector",
+        vector_b=series.vector_b * length[:, None],
+        reference_f=field,
+        sigma=series.sigma * length,
     )
     a = multiple_model.run(record, belief, every=10)
     b = multiple_model.run(dataclasses.replace(record, vectors=(whole,)), belief, every=10)
@@ -414,27 +418,29 @@ def test_whole_vectors_count_by_their_direction():
 def test_a_measured_attitude_needs_no_bank_and_counts_once():
     time, q, sigma = np.arange(11.0), quaternion.exp(np.array([0.3, 0.2, -0.5])), np.array([1e-4, 1e-4, 1e-3])
     record = resting(tracker(time, q, sigma), time=time)
-    found = multiple_model.run(record, QUIET, bias_sigma=1e-4)
-    assert found.became_one == 0.0
-    assert quaternion.angle_between(found.estimate.attitude, q).max() < 1e-12
-    assert np.allclose(found.estimate.sigma[0, :3], sigma)
-    np.testing.assert_array_equal(found.estimate.innovations["tracker"].time, time[1:])
+    bank = multiple_model.run(record, QUIET, bias_sigma=1e-4)
+    assert bank.became_one == 0.0
+    assert quaternion.angle_between(bank.estimate.attitude, q).max() < 1e-12
+    assert np.allclose(bank.estimate.sigma[0, :3], sigma)
+    np.testing.assert_array_equal(bank.estimate.innovations["tracker"].time, time[1:])
     start = estimation.State(attitude=q, bias=np.zeros(3), covariance=np.diag([*sigma**2, *[1e-8] * 3]))
     rest = dataclasses.replace(record, vectors=(record.vectors[0].taken(time > 0.0),))
     single = estimation.run(rest, QUIET, start, full_covariance=True)
-    np.testing.assert_allclose(found.estimate.covariance, single.covariance, rtol=1e-12, atol=1e-20)
+    np.testing.assert_allclose(bank.estimate.covariance, single.covariance, rtol=1e-12, atol=1e-20)
 
 
 def test_it_starts_at_the_first_direction_and_counts_what_came_before():
     record, belief = orbit(7, duration=600.0)
-    one = record.vectors[0]
-    gap = dataclasses.replace(one, vector_b=np.where(np.arange(len(one.time))[:, None] < 3, np.nan, one.vector_b))
+    series = record.vectors[0]
+    gap = dataclasses.replace(
+        series, vector_b=np.where(np.arange(len(series.time))[:, None] < 3, np.nan, series.vector_b)
+    )
     compass = series_of("compass", "heading", [5.0, 17.0], np.tile([1.0, 0.0, 0.0], (2, 1)), [1.0, 0.0, 0.0], 9.0)
-    found = multiple_model.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
-    assert found.estimate.skipped == {"magnetometer": 3, "compass": 2}
-    assert found.estimate.time[0] == 42.0  # the first kept edge not before 40 s
-    assert np.array_equal(found.estimate.time, record.time[found.edges])
-    e, _ = judged(found, record)
+    bank = multiple_model.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
+    assert bank.estimate.skipped == {"magnetometer": 3, "compass": 2}
+    assert bank.estimate.time[0] == 42.0  # the first kept edge not before 40 s
+    assert np.array_equal(bank.estimate.time, record.time[bank.edges])
+    e, _ = judged(bank, record)
     assert np.linalg.norm(e[-1, :3]) < 5.0 * DEGREE
 
 
@@ -448,10 +454,10 @@ def test_one_direction_between_edges_starts_there():
     measured = quaternion.rotate(quaternion.conjugate(attitude), references)
     star = series_of("star", "direction", at, measured, references, 1e-4)
     record = ImuRecord(time=time, increments=np.tile(rate, (8, 1)), vectors=(star,))
-    found = multiple_model.run(record, QUIET, bias_sigma=1e-8)
-    assert found.estimate.time[0] == 1.0
-    truth = quaternion.multiply(q, quaternion.exp(found.estimate.time[:, None] * rate))
-    assert quaternion.angle_between(found.estimate.attitude, truth)[1:].max() < 1e-4
+    bank = multiple_model.run(record, QUIET, bias_sigma=1e-8)
+    assert bank.estimate.time[0] == 1.0
+    truth = quaternion.multiply(q, quaternion.exp(bank.estimate.time[:, None] * rate))
+    assert quaternion.angle_between(bank.estimate.attitude, truth)[1:].max() < 1e-4
 
 
 @pytest.mark.parametrize("duration", [60.0, 1500.0], ids=["many", "one"])
@@ -461,10 +467,10 @@ def test_gaps_of_the_gyro_are_reported_whether_hypotheses_were_many_or_one(durat
     early, late = edges // 3, edges - edges // 6
     later = np.where(np.arange(edges) > early, 8.0, 0.0) + np.where(np.arange(edges) > late, 9.0, 0.0)
     gaps = dataclasses.replace(record, time=record.time + later)
-    found = multiple_model.run(gaps, belief, every=5)
-    assert found.converged == (duration > 60.0)
-    assert found.estimate.events == tuple(estimation.gaps(gaps))
-    assert [(one.start, one.end) for one in found.estimate.events] == [
+    bank = multiple_model.run(gaps, belief, every=5)
+    assert bank.converged == (duration > 60.0)
+    assert bank.estimate.events == tuple(estimation.gaps(gaps))
+    assert [(event.start, event.end) for event in bank.estimate.events] == [
         (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
     ]
     assert multiple_model.run(record, belief, every=5).estimate.events == ()
@@ -484,16 +490,16 @@ def test_noise_by_axis_is_that_of_the_filter(kind):
     first = tracker([0.5], [1.0, 0.0, 0.0, 0.0], 3e-3)
     record = ImuRecord(time=np.arange(41.0), increments=np.zeros((40, 3)), vectors=(first, second))
     process = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
-    found = multiple_model.run(record, process, bias_sigma=1e-4, every=40)
+    bank = multiple_model.run(record, process, bias_sigma=1e-4, every=40)
     start = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
     rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
     single = estimation.run(rest, process, start, full_covariance=True)
-    np.testing.assert_allclose(found.estimate.covariance[-1], single.covariance[-1], rtol=1e-9, atol=1e-20)
+    np.testing.assert_allclose(bank.estimate.covariance[-1], single.covariance[-1], rtol=1e-9, atol=1e-20)
 
 
 def test_the_bias_is_found_from_twenty_degrees_an_hour():
     record, belief = orbit(9, duration=9000.0)
-    found = multiple_model.run(record, belief, every=100)
-    e, _ = judged(found, record)
+    bank = multiple_model.run(record, belief, every=100)
+    e, _ = judged(bank, record)
     assert np.abs(record.truth.bias[0]).max() > 5.0 * DEGREE_PER_HOUR
     assert np.abs(e[-1, 3:]).max() < 0.1 * DEGREE_PER_HOUR

@@ -167,10 +167,10 @@ def test_stamps_that_stray_are_taken_for_even_and_said():
     late[1000:] += 1.0
     from strapdown.recordings import samples
 
-    found = samples._of_recording(replace(whole, time=late), "gyro", True)
-    assert "deviate by up to" in found.remarks[0]
-    assert abs(found.sample_interval - DT) < 1e-4
-    assert abs(np.isnan(found.values[:, 0]).sum() - 100) <= 2
+    gyro_samples = samples._of_recording(replace(whole, time=late), "gyro", True)
+    assert "deviate by up to" in gyro_samples.remarks[0]
+    assert abs(gyro_samples.sample_interval - DT) < 1e-4
+    assert abs(np.isnan(gyro_samples.values[:, 0]).sum() - 100) <= 2
     with pytest.raises(InputError, match="cut the recording to a part with equal sample intervals"):
         samples._of_recording(replace(whole, time=late), "gyro", False)
 
@@ -209,19 +209,21 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     time, rise = np.linspace(0.0, 100.0, 101), 0.05
     T = 24.0 + rise * time
     warm = Recording(source="warm", time=time, rate=np.ones((101, 3)), temperature=T)
-    given = {"reference_degc": 25.0, "lowest_degc": 20.0, "highest_degc": 27.0}
-    given |= {"bias_rad_per_s": [0.1, 0.2, 0.3], "bias_rad_per_s_per_k": [1e-2, 0.0, 0.0]}
-    given |= {"bias_rad_per_s_per_k2": [0.0, 1e-3, 0.0]}
-    given |= {"sigma_rad_per_s_per_k": [0.0, 0.0, 2e-4], "sigma_rad_per_s_per_k2": [0.0, 0.0, 0.0]}
-    table = from_table(given, "file: gyro")
-    found, walk = gyro_temperature.applied(warm, table), table.walk(T, time)
+    entries = {"reference_degc": 25.0, "lowest_degc": 20.0, "highest_degc": 27.0}
+    entries |= {"bias_rad_per_s": [0.1, 0.2, 0.3], "bias_rad_per_s_per_k": [1e-2, 0.0, 0.0]}
+    entries |= {"bias_rad_per_s_per_k2": [0.0, 1e-3, 0.0]}
+    entries |= {"sigma_rad_per_s_per_k": [0.0, 0.0, 2e-4], "sigma_rad_per_s_per_k2": [0.0, 0.0, 0.0]}
+    table = from_table(entries, "file: gyro")
+    corrected, walk = gyro_temperature.applied(warm, table), table.walk(T, time)
     held = np.minimum(T, 27.0) - 25.0  # beyond the table's range the bias at its end
     expected = 1.0 - np.stack([0.1 + 1e-2 * held, 0.2 + 1e-3 * held**2, np.full(101, 0.3)], axis=1)
-    np.testing.assert_allclose(found.rate, expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(corrected.rate, expected, rtol=0, atol=1e-15)
     assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
-    assert "40 samples are beyond 20 to 27 °C" in found.remarks[-1]
+    assert "40 samples are beyond 20 to 27 °C" in corrected.remarks[-1]
     np.testing.assert_allclose(table.slope_sigma, [0.0, 0.0, 2e-4])
-    bent = from_table({**given, "sigma_rad_per_s_per_k2": [0.0, 3e-5, 3e-5]}, "file")  # 2 σ₂ (T − T₀) at 20 °C, 5 K off
+    bent = from_table(
+        {**entries, "sigma_rad_per_s_per_k2": [0.0, 3e-5, 3e-5]}, "file"
+    )  # 2 σ₂ (T − T₀) at 20 °C, 5 K off
     np.testing.assert_allclose(bent.slope_sigma, [0.0, 3e-4, np.hypot(2e-4, 3e-4)])
     # A thermometer that is slower than the gyro: between its samples the line.
     slow = np.where(np.arange(101) % 10 == 0, T, np.nan)
@@ -231,7 +233,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     with pytest.raises(InputError, match="warm has no temperature; leave out"):
         gyro_temperature.applied(replace(warm, temperature=None), table)
     with pytest.raises(InputError, match="file: gyro lacks bias_rad_per_s"):
-        from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
+        from_table({k: v for k, v in entries.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
 @pytest.mark.slow
@@ -269,14 +271,14 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succe
         succeeds("simulate", f"{name}.toml")
     succeeds("allan", "lab.h5", "--temperature", 2)
     path = tmp_path / "allan-results" / "gyro-temperature.toml"
-    found = tomllib.loads(path.read_text())["gyro"]["temperature"]
-    T0 = found["reference_degc"] - 30.0
+    unit_table = tomllib.loads(path.read_text())["gyro"]["temperature"]
+    T0 = unit_table["reference_degc"] - 30.0
     for key, truth in (("k", [2e-4, -1e-4 + 8e-6 * T0, 0.0]), ("k2", [0.0, 4e-6, 0.0])):
-        off = np.array(found[f"bias_rad_per_s_per_{key}"]) - truth
-        assert (np.abs(off) < 4.0 * np.array(found[f"sigma_rad_per_s_per_{key}"])).all()
+        off = np.array(unit_table[f"bias_rad_per_s_per_{key}"]) - truth
+        assert (np.abs(off) < 4.0 * np.array(unit_table[f"sigma_rad_per_s_per_{key}"])).all()
     text = (tmp_path / "allan-results" / "gyro.toml").read_text()
     both = tomllib.loads(text + path.read_text())["gyro"]  # the two files in one are a gyro's table
-    assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
+    assert gyro.from_table(both).temperature.span == (unit_table["lowest_degc"], unit_table["highest_degc"])
     succeeds("convert", "use.h5", "use.db3")
     succeeds("estimate", "use.db3", "--temperature", path)
     estimate = setup.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
@@ -361,12 +363,12 @@ def test_the_interval_of_the_largest_axis_covers_it(axes, others):
     """Estimates that are log-normal about the truth, σ 5 %, as their intervals say: 5,000 of them."""
     truth = np.array([2.0, *[2.0 * others] * (axes - 1)])
     draws = np.random.default_rng(5).standard_normal((5_000, axes))
-    one = allan.fit_noise(draws[:500], 0.01, terms=("angle_random_walk",))
+    template = allan.fit_noise(draws[:500], 0.01, terms=("angle_random_walk",))
     estimate = truth * np.exp(0.05 * draws)
     reach = np.exp(0.05 * 1.959964)
     inside = []
     for row in estimate:
-        fit = replace(one, estimate=row[:, None], lower=row[:, None] / reach, upper=row[:, None] * reach)
+        fit = replace(template, estimate=row[:, None], lower=row[:, None] / reach, upper=row[:, None] * reach)
         low, high = noise_parameters.largest_interval(fit, "angle_random_walk")
         inside.append(low <= 2.0 <= high)
     assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 5_000)
@@ -403,9 +405,9 @@ def test_flicker_is_covered_at_every_frequency_that_the_filter_of_the_tilt_follo
     """At the natural frequency ω of the filter the covering spectrum σ_v² + σ_u²/ω² is at least 2/π of the flicker's, B²/ω."""
     spec = gyro.GyroSpec(angle_random_walk=1e-4, bias_instability=FLICKER)
     for parameters in itertools.chain(*ahrs.MOTIONS.values()):
-        found = workflows.filters.with_gyro_noise(parameters, spec)
-        white = found.angle_random_walk**2 - spec.angle_random_walk**2
-        walk = found.rate_random_walk**2
+        filter_parameters = workflows.filters.with_gyro_noise(parameters, spec)
+        white = filter_parameters.angle_random_walk**2 - spec.angle_random_walk**2
+        walk = filter_parameters.rate_random_walk**2
         assert white > 0.0
         assert walk > 0.0
         natural = np.sqrt(walk / white)  # where the two parts of the covering spectrum cross
@@ -417,5 +419,5 @@ def test_flicker_is_covered_at_every_frequency_that_the_filter_of_the_tilt_follo
 
 def test_a_gyro_without_flicker_keeps_its_own_noise():
     spec = gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=2e-6)
-    found = workflows.filters.with_gyro_noise(ahrs.HAND_HELD, spec)
-    assert (found.angle_random_walk, found.rate_random_walk) == (1e-4, 2e-6)
+    filter_parameters = workflows.filters.with_gyro_noise(ahrs.HAND_HELD, spec)
+    assert (filter_parameters.angle_random_walk, filter_parameters.rate_random_walk) == (1e-4, 2e-6)

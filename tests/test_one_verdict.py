@@ -18,7 +18,7 @@ STATUS = {"consistent": 0, "not consistent": 1, "cannot tell": 3}
 
 
 def run(*arguments: object) -> int:
-    return int(CliRunner().invoke(app, [str(one) for one in arguments]).exit_code)
+    return int(CliRunner().invoke(app, [str(argument) for argument in arguments]).exit_code)
 
 
 def agree(result, file: Path) -> dict:
@@ -68,9 +68,9 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
     result = sd.estimate(recording)
     file = tmp_path / "out" / "estimate.h5"
     assert sd.read(file) == result
-    found = agree(result, file)
-    assert any(one["name"] != "NIS" for one in found["findings"])  # the reference takes part
-    assert sd.check(result, recording).summary() == found
+    summary = agree(result, file)
+    assert any(finding["name"] != "NIS" for finding in summary["findings"])  # the reference takes part
+    assert sd.check(result, recording).summary() == summary
     assert sd.read(sd.write(result, tmp_path / "again.h5")) == result
 
 
@@ -94,8 +94,8 @@ def test_a_filter_with_an_error_of_its_own_by_every_way(tmp_path):
     source = sd.write(record, tmp_path / "record.h5")
     setup = sd.FilterSetup.for_record(record)
     assert setup.integration.name == "one-sample"
-    given = sd.write(setup, tmp_path / "filter.toml")
-    assert run("estimate", source, "--filter", given, "--out", tmp_path / "out") == 0
+    filter_file = sd.write(setup, tmp_path / "filter.toml")
+    assert run("estimate", source, "--filter", filter_file, "--out", tmp_path / "out") == 0
     result = sd.estimate(sd.read(source), setup=setup)
     assert sd.read(tmp_path / "out" / "estimate.h5") == result
     assert agree(result, tmp_path / "out" / "estimate.h5")["verdict"] == "not consistent"

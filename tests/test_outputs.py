@@ -31,9 +31,9 @@ def covariances(n: int = 20) -> np.ndarray:
 @pytest.mark.parametrize("sequence", [*SEQUENCES, *(s.lower() for s in SEQUENCES)])
 def test_euler_angles_are_scipys_and_their_sigma_that_of_differences(sequence):
     q, P = attitudes(), covariances()
-    found = outputs.euler(q, sequence, P)
+    euler = outputs.euler(q, sequence, P)
     rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]])
-    np.testing.assert_allclose(found.angles, rotation.as_euler(sequence), atol=1e-12)
+    np.testing.assert_allclose(euler.angles, rotation.as_euler(sequence), atol=1e-12)
     step = 1e-6
     J = np.empty((len(q), 3, 3))
     for k in range(3):
@@ -41,7 +41,7 @@ def test_euler_angles_are_scipys_and_their_sigma_that_of_differences(sequence):
         change = (rotation * turn).as_euler(sequence) - (rotation * turn.inv()).as_euler(sequence)
         J[:, :, k] = (np.mod(change + np.pi, 2 * np.pi) - np.pi) / (2 * step)
     expected = np.sqrt(np.einsum("nij,njk,nik->ni", J, P, J))
-    np.testing.assert_allclose(found.sigma, expected, rtol=1e-5)
+    np.testing.assert_allclose(euler.sigma, expected, rtol=1e-5)
 
 
 def test_gimbal_lock_has_no_sigma():
@@ -62,9 +62,9 @@ def test_what_is_no_sequence_is_refused(bad):
 def test_heading_is_from_north_towards_east(yaw, axis, degrees):
     """East-North-Up: at rest the body's x looks East; a turn to the left about up takes it North."""
     q = quaternion.from_rotation(Rotation.from_euler("z", yaw, degrees=True))
-    found = outputs.heading(q[None], np.diag([1.0, 4.0, 9.0])[None], axis=axis)
-    assert abs((np.degrees(found.angles[0]) - degrees + 180.0) % 360.0 - 180.0) < 1e-9
-    assert abs(found.sigma[0] - 3.0) < 1e-12  # level: a turn about up alone moves it
+    heading = outputs.heading(q[None], np.diag([1.0, 4.0, 9.0])[None], axis=axis)
+    assert abs((np.degrees(heading.angles[0]) - degrees + 180.0) % 360.0 - 180.0) < 1e-9
+    assert abs(heading.sigma[0] - 3.0) < 1e-12  # level: a turn about up alone moves it
 
 
 def test_heading_refuses_what_is_no_axis():
@@ -74,7 +74,7 @@ def test_heading_refuses_what_is_no_axis():
 
 def test_heading_of_a_tilted_body_has_the_sigma_of_differences():
     q, P = attitudes(), covariances()
-    found = outputs.heading(q, P)
+    heading = outputs.heading(q, P)
     rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]])
     J = np.empty((len(q), 3))
     for k in range(3):
@@ -83,7 +83,7 @@ def test_heading_of_a_tilted_body_has_the_sigma_of_differences():
             v = (rotation * Rotation.from_rotvec(step * np.eye(3)[k])).apply([1.0, 0.0, 0.0])
             both.append(np.arctan2(v[:, 0], v[:, 1]))
         J[:, k] = (np.mod(both[0] - both[1] + np.pi, 2 * np.pi) - np.pi) / 2e-6
-    np.testing.assert_allclose(found.sigma, np.sqrt(np.einsum("ni,nij,nj->n", J, P, J)), rtol=1e-5)
+    np.testing.assert_allclose(heading.sigma, np.sqrt(np.einsum("ni,nij,nj->n", J, P, J)), rtol=1e-5)
     up = quaternion.from_rotation(Rotation.from_euler("y", -90.0, degrees=True))
     assert np.isinf(outputs.heading(up[None], np.eye(3)[None]).sigma[0])
 
@@ -132,23 +132,23 @@ def case():
 
 def test_a_table_says_all_in_its_names(case):
     estimate, recording = case
-    found = estimate.table(recording=recording)
-    assert found["time_ns"][3] == 1_700_000_000_130_000_001
-    np.testing.assert_array_equal(found["qw"], estimate.attitude[:, 0])
+    table = estimate.table(recording=recording)
+    assert table["time_ns"][3] == 1_700_000_000_130_000_001
+    np.testing.assert_array_equal(table["qw"], estimate.attitude[:, 0])
     yaw = Rotation.from_quat(estimate.attitude[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True)
-    np.testing.assert_allclose(np.stack([found[f"{n}_deg"] for n in ("yaw", "pitch", "roll")], axis=1), yaw, atol=1e-10)
-    np.testing.assert_allclose(found["rate_y_rad_per_s"], recording.rate[10:, 1] - estimate.bias[:, 1], rtol=1e-15)
-    np.testing.assert_allclose(found["bias_z_deg_per_h"], np.degrees(estimate.bias[:, 2]) * 3600.0, rtol=1e-12)
+    np.testing.assert_allclose(np.stack([table[f"{n}_deg"] for n in ("yaw", "pitch", "roll")], axis=1), yaw, atol=1e-10)
+    np.testing.assert_allclose(table["rate_y_rad_per_s"], recording.rate[10:, 1] - estimate.bias[:, 1], rtol=1e-15)
+    np.testing.assert_allclose(table["bias_z_deg_per_h"], np.degrees(estimate.bias[:, 2]) * 3600.0, rtol=1e-12)
     np.testing.assert_allclose(
-        found["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
+        table["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
     )
     for name, place in (("xy_rad2", (0, 1)), ("xby_rad2_per_s", (0, 4)), ("bxby_rad2_per_s2", (3, 4))):
-        np.testing.assert_array_equal(found[f"cov_body_{name}"], estimate.covariance[:, *place])
+        np.testing.assert_array_equal(table[f"cov_body_{name}"], estimate.covariance[:, *place])
     ned = estimate.table(recording=recording, frame="NED", sequence="ZXZ")
-    np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], found["free_acceleration_y_m_per_s2"], rtol=1e-15)
-    np.testing.assert_allclose(ned["free_acceleration_z_m_per_s2"], -found["free_acceleration_z_m_per_s2"], rtol=1e-15)
+    np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], table["free_acceleration_y_m_per_s2"], rtol=1e-15)
+    np.testing.assert_allclose(ned["free_acceleration_z_m_per_s2"], -table["free_acceleration_z_m_per_s2"], rtol=1e-15)
     assert "angle_1_z_deg" in ned
-    np.testing.assert_array_equal(ned["heading_deg"], found["heading_deg"])
+    np.testing.assert_array_equal(ned["heading_deg"], table["heading_deg"])
     with pytest.raises(InputError, match=r"walk has no stamp 0.1 s"):
         estimate.table(recording=recording.since(20))
 
@@ -173,7 +173,7 @@ def test_tables_in_files_hold_the_same_numbers(case, tmp_path, ending):
     if ending == "parquet":
         import pyarrow.parquet
 
-        found = {
+        columns = {
             name: column.to_numpy()
             for name, column in zip(wanted, pyarrow.parquet.read_table(path).columns, strict=True)
         }
@@ -181,10 +181,10 @@ def test_tables_in_files_hold_the_same_numbers(case, tmp_path, ending):
         with open(path, newline="") as stream:
             rows = list(csv.reader(stream, delimiter="\t" if ending == "tsv" else ","))
         assert rows[0] == list(wanted)
-        found = {name: np.array([float(row[k]) for row in rows[1:]]) for k, name in enumerate(rows[0])}
+        columns = {name: np.array([float(row[k]) for row in rows[1:]]) for k, name in enumerate(rows[0])}
         assert rows[4][0] == "1700000000130000001"
     for name, values in wanted.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+        np.testing.assert_array_equal(columns[name], values, err_msg=name)
 
 
 def test_a_tum_trajectory_and_the_packages_own_file(case, tmp_path):
@@ -254,6 +254,6 @@ def test_the_free_acceleration_of_a_table_is_along_the_axes_of_its_frame(frame, 
     force = np.tile([1.0, 2.0, 3.0 + STANDARD_GRAVITY], (3, 1))
     recording = Recording(source="x", time=time, rate=np.zeros((3, 3)), specific_force=force)
     estimate = Estimate.from_arrays(time, np.tile([1.0, 0, 0, 0], (3, 1)), np.tile(np.eye(3), (3, 1, 1)))
-    found = estimate.table(recording=recording, frame=frame)
+    table = estimate.table(recording=recording, frame=frame)
     for axis, value in zip("xyz", expected, strict=True):
-        np.testing.assert_allclose(found[f"free_acceleration_{axis}_m_per_s2"], value, atol=1e-14)
+        np.testing.assert_allclose(table[f"free_acceleration_{axis}_m_per_s2"], value, atol=1e-14)

@@ -22,7 +22,7 @@ IGNAGNI = coning.read_algorithms(EXAMPLES / "ignagni-1996.toml")
 MILLER = coning.named(str(EXAMPLES / "miller-1983.toml"))
 
 
-@pytest.mark.parametrize("own", IGNAGNI, ids=lambda one: one.name)
+@pytest.mark.parametrize("own", IGNAGNI, ids=lambda algorithm: algorithm.name)
 def test_ignagnis_table_is_the_closed_form_and_drifts_as_he_says(own):
     m = own.samples
     built_in = next(a for a in ALGORITHMS.values() if (a.solver, a.samples, a.window) == ("compressed", m, m))
@@ -59,10 +59,10 @@ def test_textbook_order_is_that_of_the_increments():
 
 def test_derived_orders_are_those_of_the_catalogue():
     compared = 0
-    for one in ALGORITHMS.values():
-        if one.solver in ("compressed", "pairs") and not one.rate_points:
-            own = Algorithm.from_table(one.to_table())
-            assert own == one, one.name
+    for algorithm in ALGORITHMS.values():
+        if algorithm.solver in ("compressed", "pairs") and not algorithm.rate_points:
+            own = Algorithm.from_table(algorithm.to_table())
+            assert own == algorithm, algorithm.name
             compared += 1
     assert compared > 30
 
@@ -82,8 +82,8 @@ def test_the_order_of_convergence_shows_over_a_manoeuvre(own, order):
 
     def error(rate):
         edges = np.arange(int(2.0 * rate) // own.samples * own.samples + 1) / rate
-        found = coning.integrate(path.increments(edges), own, path.attitude(0.0))
-        return quaternion.angle_between(path.attitude(edges[:: own.samples]), found).max()
+        attitude = coning.integrate(path.increments(edges), own, path.attitude(0.0))
+        return quaternion.angle_between(path.attitude(edges[:: own.samples]), attitude).max()
 
     errors = np.array([error(rate) for rate in (240.0, 480.0, 960.0)])
     slopes = np.log2(errors[:-1] / errors[1:])
@@ -120,9 +120,9 @@ def test_a_setup_with_it_is_read_back(tmp_path):
     from strapdown import montecarlo, scenarios
 
     scenario = scenarios.load_scenario("two-stars")
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), integration=MILLER)
-    assert setup.from_toml(setup.to_toml(chosen)) == chosen
-    plan = montecarlo.Plan(scenario=scenario, setup=chosen, epochs=1)
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), integration=MILLER)
+    assert setup.from_toml(setup.to_toml(filter_setup)) == filter_setup
+    plan = montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=1)
     assert montecarlo.from_table(json.loads(json.dumps(plan.to_table()))).digest == plan.digest
 
 
@@ -130,8 +130,8 @@ def test_every_command_takes_a_file_for_a_name():
     assert coning.named(str(EXAMPLES / "miller-1983.toml")) == MILLER
     line = coning.VibrationLine(frequency=10.0, angle=0.1 * DEGREE)
     names = (str(EXAMPLES / "miller-1983.toml"), "three-sample")
-    one, other = (coning.vibration_drift((line,), name, 200.0) for name in names)
-    assert one == pytest.approx(other, rel=1e-12)  # the same lag sums
+    own, built_in = (coning.vibration_drift((line,), name, 200.0) for name in names)
+    assert own == pytest.approx(built_in, rel=1e-12)  # the same lag sums
 
 
 @pytest.mark.parametrize(
@@ -178,6 +178,6 @@ def test_several_algorithms_need_names_of_their_own(tmp_path):
 @pytest.mark.parametrize(("name", "best"), [("two-sample", 60), ("three-sample", 280)])
 def test_the_best_drift_constant_is_that_of_the_compressed_algorithm_of_as_many_increments(name, best):
     """(M!)²/(2 (2M + 1)!): 1/12, 1/60, 1/280, …, which the frequency-series algorithms reach."""
-    found = coning_study.own_summary(ALGORITHMS[name])
-    assert found["best_drift_constant"] == pytest.approx(1.0 / best, rel=1e-12)
-    assert found["drift_constant_value"] == pytest.approx(1.0 / best, rel=1e-12)
+    summary = coning_study.own_summary(ALGORITHMS[name])
+    assert summary["best_drift_constant"] == pytest.approx(1.0 / best, rel=1e-12)
+    assert summary["drift_constant_value"] == pytest.approx(1.0 / best, rel=1e-12)

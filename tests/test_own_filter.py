@@ -53,10 +53,10 @@ def with_filter(estimator, plan=PLAN):
     return replace(plan, setup=replace(SETUP, estimator=estimator))
 
 
-def same(one, other, but=()):
-    for field in fields(one):
+def same(first, second, but=()):
+    for field in fields(first):
         if field.name not in ("plan", *but):
-            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+            np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name), err_msg=field.name)
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +76,10 @@ def test_a_filter_at_fewer_times_is_judged_by_the_last_before_each_epoch(own):
     def sparse(record, initial):
         estimate = wrapped(record, initial)
         rows = slice(None, None, 5)
-        made = Estimate.from_arrays(
+        fewer = Estimate.from_arrays(
             estimate.time[rows], estimate.attitude[rows], estimate.covariance[rows], bias=estimate.bias[rows]
         )
-        return replace(made, innovations=estimate.innovations)
+        return replace(fewer, innovations=estimate.innovations)
 
     same(own, montecarlo.run_plan(with_filter(sparse), runs=12, chunk=5))
 
@@ -89,8 +89,8 @@ def test_with_a_coning_algorithm_it_gets_the_longer_steps():
 
     four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
     plan = replace(PLAN, setup=four, epochs=5)
-    one = montecarlo.run_plan(plan, runs=4, machine="scalar")
-    same(one, montecarlo.run_plan(replace(plan, setup=replace(four, estimator=wrapped)), runs=4))
+    statistics = montecarlo.run_plan(plan, runs=4, machine="scalar")
+    same(statistics, montecarlo.run_plan(replace(plan, setup=replace(four, estimator=wrapped)), runs=4))
 
 
 def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
@@ -101,7 +101,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert np.isnan(statistics.rms_error[:, 3:]).all()
     assert np.isnan(statistics.anees[:, [0, 2]]).all()
     judgement = statistics.judge()
-    assert {one.of for one in judgement.findings if "NEES" in one.name} == {"attitude"}
+    assert {finding.of for finding in judgement.findings if "NEES" in finding.name} == {"attitude"}
     assert list(montecarlo.summary(statistics)["nees"]) == ["attitude"]
     campaign.run(with_filter(attitude_only), tmp_path / "own.h5", runs=12)
     page, numbers = campaigns.report(tmp_path / "own.h5")
@@ -116,7 +116,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
 def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
     judgement = montecarlo.run_plan(with_filter(attitude_only), runs=250).judge()
     assert judgement.verdict == "consistent"
-    assert [one.of for one in judgement.parts if "innov" not in one.of] == ["attitude"]
+    assert [part.of for part in judgement.parts if "innov" not in part.of] == ["attitude"]
     assert "bias" not in judgement.words
 
 
@@ -286,8 +286,8 @@ def test_the_packages_other_filter_runs_in_a_monte_carlo_by_name():
         return filters.run(name, record, SETUP.process_noise, initial, full_covariance=True)
 
     same(montecarlo.run_plan(with_filter(name), runs=3), montecarlo.run_plan(with_filter(by_hand), runs=3))
-    chosen = replace(SETUP, estimator=name)
-    assert setup.from_toml(setup.to_toml(chosen)) == chosen != SETUP
+    filter_setup = replace(SETUP, estimator=name)
+    assert setup.from_toml(setup.to_toml(filter_setup)) == filter_setup != SETUP
     assert "estimator" not in setup.to_table(SETUP)
 
 
@@ -309,18 +309,18 @@ def test_one_run_is_judged(own):
     again = montecarlo.replay(with_filter(own_filter.textbook), 1)
     truth = again.record.truth
     judged = consistency.judge(again.estimate, truth)
-    assert {one.of for one in judged.findings} == {"state", "attitude", "bias"}
+    assert {finding.of for finding in judged.findings} == {"state", "attitude", "bias"}
     alone = montecarlo.replay(with_filter(attitude_only), 1).estimate
-    assert {one.of for one in consistency.judge(alone, truth).findings} == {"attitude"}
+    assert {finding.of for finding in consistency.judge(alone, truth).findings} == {"attitude"}
     no_bias = Truth(attitude=truth.attitude, bias=np.full_like(truth.bias, np.nan))
-    assert {one.of for one in consistency.judge(again.estimate, no_bias).findings} == {"attitude"}
+    assert {finding.of for finding in consistency.judge(again.estimate, no_bias).findings} == {"attitude"}
 
 
 @pytest.mark.slow
 def test_the_example_tells_the_right_filter_from_the_faulty_one():
-    found = own_filter.main(runs=100, duration=60.0, seed=1)
-    assert found.verdicts["textbook"].startswith("consistent")
-    assert found.verdicts["turned reference"].startswith("not consistent")
+    study = own_filter.main(runs=100, duration=60.0, seed=1)
+    assert study.verdicts["textbook"].startswith("consistent")
+    assert study.verdicts["turned reference"].startswith("not consistent")
 
 
 def test_bad_filters_are_refused():
@@ -356,12 +356,12 @@ def test_bad_filters_are_refused():
 
 def test_what_works_with_the_mekf_alone_says_so():
     record = montecarlo.replay(PLAN, 0, machine="scalar")
-    chosen = replace(SETUP, estimator=wrapped)
+    filter_setup = replace(SETUP, estimator=wrapped)
     for work in (
-        lambda: setup.smooth(record.record, chosen, record.initial),
-        lambda: setup.observability(record.record, chosen, record.initial),
-        lambda: covariance.analyse(SCENARIO, chosen),
-        lambda: tuning.likelihood([tuning.record_case(record.record, SETUP)], chosen, ["gyro.arw"]),
+        lambda: setup.smooth(record.record, filter_setup, record.initial),
+        lambda: setup.observability(record.record, filter_setup, record.initial),
+        lambda: covariance.analyse(SCENARIO, filter_setup),
+        lambda: tuning.likelihood([tuning.record_case(record.record, SETUP)], filter_setup, ["gyro.arw"]),
     ):
         with pytest.raises(InputError, match="needs the mekf, but the estimator is wrapped"):
             work()
@@ -393,10 +393,10 @@ def star_tracker(rate=1.0, duration=2000.0, **gyro):
 
 
 def cramer_rao(scene, attitude_sigma, bias_sigma, epochs):
-    chosen = replace(
+    filter_setup = replace(
         setup.FilterSetup.for_scenario(scene, states=False), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma
     )
-    return covariance.analyse(scene, chosen, epochs=epochs).cramer_rao
+    return covariance.analyse(scene, filter_setup, epochs=epochs).cramer_rao
 
 
 def test_the_bound_ends_in_farrenkopfs_steady_state():
@@ -441,9 +441,9 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
     lesser = cramer_rao(star_tracker(rate=0.5, duration=60.0), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=6)
     predicted = np.sqrt(np.diagonal(lesser, axis1=1, axis2=2) / np.diagonal(bound, axis1=1, axis2=2))
     assert predicted[-1, 0] > 1.1
-    for given, sigma in ((montecarlo.Dispersions(), 1e-3), (montecarlo.Dispersions(attitude_sigma=3e-3), 3e-3)):
+    for dispersions, sigma in ((montecarlo.Dispersions(), 1e-3), (montecarlo.Dispersions(attitude_sigma=3e-3), 3e-3)):
         least = cramer_rao(scene, attitude_sigma=sigma, bias_sigma=1e-5, epochs=6)
-        np.testing.assert_array_equal(verdicts.bound_of(replace(plan, dispersions=given)), least)
+        np.testing.assert_array_equal(verdicts.bound_of(replace(plan, dispersions=dispersions)), least)
     for error in ({"attitude_error": (1e-3, 0, 0)}, {"bias_error": (1e-6, 0, 0)}):
         assert verdicts.bound_of(replace(plan, dispersions=montecarlo.Dispersions(**error))) is None
     runs = 300
@@ -465,24 +465,24 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
 def test_a_comparison_gives_errors_over_the_bound():
     scene = star_tracker(duration=60.0)
     base = setup.FilterSetup.for_scenario(scene, states=False)
-    one = montecarlo.replay(Plan(scenario=scene, setup=base, seed=5, epochs=6), 0, machine="scalar")
+    replayed = montecarlo.replay(Plan(scenario=scene, setup=base, seed=5, epochs=6), 0, machine="scalar")
     bound = cramer_rao(
-        scene, attitude_sigma=base.attitude_sigma, bias_sigma=base.bias_sigma, epochs=len(one.record.increments)
+        scene, attitude_sigma=base.attitude_sigma, bias_sigma=base.bias_sigma, epochs=len(replayed.record.increments)
     )
 
     def mine(record, initial):
         return estimation.run(record, base.process_noise, initial, full_covariance=True)
 
-    found = filters.compare(
-        one.record, base.process_noise, one.initial, filters=["mekf", mine], every=2, bound=bound[::2]
+    comparison = filters.compare(
+        replayed.record, base.process_noise, replayed.initial, filters=["mekf", mine], every=2, bound=bound[::2]
     )
-    error = found.estimates["mine"]
-    turn = turn_to(error.attitude, one.record.truth.attitude[::2])
+    error = comparison.estimates["mine"]
+    turn = turn_to(error.attitude, replayed.record.truth.attitude[::2])
     ratio = turn / np.sqrt(np.diagonal(bound[::2], axis1=1, axis2=2)[:, :3])
     expected = np.sqrt(np.mean(ratio[error.time >= 30.0] ** 2))
-    assert found.summary()["mine"]["attitude_over_bound"] == pytest.approx(expected, rel=1e-12)
-    assert f"{expected:.3f}" in str(found)
+    assert comparison.summary()["mine"]["attitude_over_bound"] == pytest.approx(expected, rel=1e-12)
+    assert f"{expected:.3f}" in str(comparison)
     for bad, message in ((bound, r"bound has shape"), (bound[::2], "no truth")):
-        record = replace(one.record, truth=None) if message == "no truth" else one.record
+        record = replace(replayed.record, truth=None) if message == "no truth" else replayed.record
         with pytest.raises(InputError, match=message):
-            filters.compare(record, base.process_noise, one.initial, filters=["mekf"], every=2, bound=bad)
+            filters.compare(record, base.process_noise, replayed.initial, filters=["mekf"], every=2, bound=bad)

@@ -89,22 +89,22 @@ def uneven_series(draw):
 def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
     """By counting: which column of the time axis each sample falls into, and the extremes of the samples there."""
     time, value, columns = series
-    found = decimation.envelope(time, value, value + 1.0, columns)
+    envelope = decimation.envelope(time, value, value + 1.0, columns)
     if len(time) <= columns:
-        np.testing.assert_array_equal(found.low, value)
-        np.testing.assert_array_equal(found.high, value + 1.0)
+        np.testing.assert_array_equal(envelope.low, value)
+        np.testing.assert_array_equal(envelope.high, value + 1.0)
         return
     held = {}
     span = time[-1] - time[0]
     for t, x in zip(time, value, strict=True):
         column = min(columns - 1, int((t - time[0]) * (columns / span))) if span > 0.0 else 0
         held.setdefault(column, []).append((t, x))
-    assert len(found.time) == len(held) <= columns
+    assert len(envelope.time) == len(held) <= columns
     for k, samples in enumerate(held.values()):
-        seen = [x for _, x in samples if not np.isnan(x)]
-        assert found.time[k] == samples[0][0]
-        np.testing.assert_equal(found.low[k], min(seen, default=np.nan))
-        np.testing.assert_equal(found.high[k], max(seen, default=np.nan) + 1.0)
+        valid = [x for _, x in samples if not np.isnan(x)]
+        assert envelope.time[k] == samples[0][0]
+        np.testing.assert_equal(envelope.low[k], min(valid, default=np.nan))
+        np.testing.assert_equal(envelope.high[k], max(valid, default=np.nan) + 1.0)
 
 
 @hypothesis.settings(deadline=None)
@@ -209,9 +209,9 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, mo
 @pytest.mark.parametrize("start", [2e-4, 1e-9])
 def test_a_slice_of_the_likelihood_is_drawn_in_the_unit_of_its_axis(start):
     unit = SimpleNamespace(name="°/h", factor=units.DEGREE_PER_HOUR)
-    one = SimpleNamespace(name="b", unit=unit, start=start, value=1e-4, lower=6e-5, upper=1.5e-4, identified=True)
+    parameter = SimpleNamespace(name="b", unit=unit, start=start, value=1e-4, lower=6e-5, upper=1.5e-4, identified=True)
     slices = SimpleNamespace(values=np.geomspace(4e-5, 3e-4, 9)[None], fallen=np.arange(9.0)[None])
-    ax = tuning.likelihood_slice(slices, SimpleNamespace(parameters=(one,), composite=False), 0)
+    ax = tuning.likelihood_slice(slices, SimpleNamespace(parameters=(parameter,), composite=False), 0)
     levels = {line.get_label(): line for line in ax.lines}
     np.testing.assert_allclose(ax.lines[0].get_xdata() * units.DEGREE_PER_HOUR, slices.values[0])
     assert levels["3.84: 95 % of χ², one parameter"].get_ydata()[0] == pytest.approx(
@@ -286,9 +286,9 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
     opposite = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
     brief = dataclasses.replace(scenario, gyro=opposite, duration=2.0)
     belief = dataclasses.replace(setup.FilterSetup.for_scenario(brief), states=None)
-    found = covariance.analyse(brief, belief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
-    assert not found.rms[0].any()
-    figure = plots.error_budget(found)
+    analysis = covariance.analyse(brief, belief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
+    assert not analysis.rms[0].any()
+    figure = plots.error_budget(analysis)
     plots.save(figure, tmp_path / "budget.png")
     named = {text.get_text() for text in figure.legends[0].get_texts()}
     assert {"angle random walk", "star 1"} <= named
@@ -302,7 +302,7 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
         (figure.axes[0], slice(3), units.ARCSECOND),
         (figure.axes[1], slice(3, 6), units.DEGREE_PER_HOUR),
     ):
-        for line, six in zip(ax.lines, (found.rms, found.filter_sigma), strict=True):
+        for line, six in zip(ax.lines, (analysis.rms, analysis.filter_sigma), strict=True):
             np.testing.assert_allclose(line.get_ydata()[1:] * size, np.sqrt(np.mean(six[1:, part] ** 2, axis=1)))
 
 
@@ -314,14 +314,14 @@ def test_drifts_that_are_rounding_are_reported_and_not_drawn(tmp_path):
         Drift(algorithm="exact", samples=1, measured=0.0, predicted=0.0),
         Drift(algorithm="without formula", samples=4, measured=1e-9 * size, predicted=np.nan),
     ]
-    for given in (drifts, drifts[1:]):
-        ax = plots.drift_by_algorithm(given)
+    for shown in (drifts, drifts[1:]):
+        ax = plots.drift_by_algorithm(shown)
         plots.save(ax.figure, tmp_path / "drift.png")
         low, high = ax.get_ylim()
         said = [text for text in ax.texts if text.get_text() == "rounding"]
         assert len(said) == 2
         assert all(low <= text.xy[1] < high for text in said)
-        assert sum(np.isfinite(bar.get_height()) for bar in ax.patches) == len(given) - 2
+        assert sum(np.isfinite(bar.get_height()) for bar in ax.patches) == len(shown) - 2
 
 
 def test_the_ellipse_holds_its_share():
@@ -514,7 +514,7 @@ def test_a_panel_says_where_a_filter_that_passes_leaves_its_bounds(statistics, o
         if at is not None:
             held[at, column] *= 10.0
         changed = dataclasses.replace(statistics, nees_sum=held)
-        shown = [dataclasses.replace(one, statistics=changed) for one in outcomes]
+        shown = [dataclasses.replace(outcome, statistics=changed) for outcome in outcomes]
         ax = plots.coning_consistency(shown).axes[0]
         title = ax.get_title(loc="left")
         assert "2 of 2 pass" in title

@@ -82,16 +82,16 @@ def hosking(z, lags):
 def test_every_statistic_of_check(run, estimated):
     said = run("check", "estimate-results/estimate.h5", "--record", "two-stars.h5", "--json", "check.json", status=3)
     saved = json.loads(Path("check.json").read_text())
-    found = {(one["name"], one["of"]): one for one in saved["findings"]}
-    assert not any(one["rejected"] for one in found.values())
+    findings = {(finding["name"], finding["of"]): finding for finding in saved["findings"]}
+    assert not any(finding["rejected"] for finding in findings.values())
     level = 0.005 / len(saved["findings"])  # all tests together, causes included, two-sided
 
     def agrees(name, of, value, p, rel=1e-6):
-        one = found[name, of]
-        assert one["value"] == pytest.approx(value, rel=rel), name
-        assert one["p_value"] == pytest.approx(p, rel=max(rel, 1e-6), abs=1e-12), name
-        assert f"{name} {of} {one['value']:.4g} " in said
-        return one
+        finding = findings[name, of]
+        assert finding["value"] == pytest.approx(value, rel=rel), name
+        assert finding["p_value"] == pytest.approx(p, rel=max(rel, 1e-6), abs=1e-12), name
+        assert f"{name} {of} {finding['value']:.4g} " in said
+        return finding
 
     with h5py.File("estimate-results/estimate.h5") as file:
         error, covariance = errors(file), file["covariance"][:]
@@ -102,13 +102,13 @@ def test_every_statistic_of_check(run, estimated):
     for star, z in white.items():
         n, m = z.shape
         total = np.sum(z**2)
-        one = agrees("NIS", star, total / (n * m), 2.0 * min(chi2.cdf(total, n * m), chi2.sf(total, n * m)))
-        assert [one["low"], one["high"]] == pytest.approx(chi2.ppf([level, 1.0 - level], n * m) / (n * m))
+        nis = agrees("NIS", star, total / (n * m), 2.0 * min(chi2.cdf(total, n * m), chi2.sf(total, n * m)))
+        assert [nis["low"], nis["high"]] == pytest.approx(chi2.ppf([level, 1.0 - level], n * m) / (n * m))
         lags = n // 50
         Q = hosking(z, lags)
         agrees("whiteness", star, Q / (m * m * lags), chi2.sf(Q, m * m * lags))
         x = np.sort(((z - z.mean(axis=0)) / z.std(axis=0, ddof=1)).ravel())
-        a = found["normality", star]
+        a = findings["normality", star]
         odd = 2.0 * np.arange(len(x)) + 1.0
         square = -len(x) - np.mean(odd * (norm.logcdf(x) + norm.logsf(x[::-1])))
         assert a["value"] == pytest.approx(square * (1.0 + 0.75 / len(x) + 2.25 / len(x) ** 2))
@@ -130,7 +130,7 @@ def test_every_statistic_of_check(run, estimated):
         square = float(nees(error[-1:, states], covariance[-1:, states, states])[0])
         agrees("NEES at the end", of, square / k, 2.0 * min(chi2.cdf(square, k), chi2.sf(square, k)), 1e-4)
     square = float(np.mean(nees(error[:, :3], covariance[:, :3, :3]))) / 3.0
-    assert found["time-averaged NEES", "attitude"]["value"] == pytest.approx(square, rel=0.02)  # every eighth epoch
+    assert findings["time-averaged NEES", "attitude"]["value"] == pytest.approx(square, rel=0.02)  # every eighth epoch
 
 
 def test_every_cause_of_check_has_the_p_value_of_its_gain(run, estimated):
@@ -191,7 +191,7 @@ def test_error_budget_of_covariance(run, tmp_path):
     """A Kalman filter written here: the gains from all noise, then each source alone through the same gains."""
     body = motion.ConstantRate(rate=(0.02, -0.03, 0.05))
     stars = {"star 1": ([1.0, 0.0, 0.0], 2e-4), "star 2": ([0.0, 0.6, 0.8], 3e-4)}
-    made = scenarios.Scenario(
+    scenario = scenarios.Scenario(
         name="turning",
         motion=body,
         gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=3e-6),
@@ -203,9 +203,9 @@ def test_error_budget_of_covariance(run, tmp_path):
         duration=60.0,
     )
     noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=3e-6)
-    chosen = setup.FilterSetup(process_noise=noise, attitude_sigma=1e-3, bias_sigma=1e-4)
-    (tmp_path / "turning.toml").write_text(scenarios.scenario_to_toml(made))
-    (tmp_path / "filter.toml").write_text(setup.to_toml(chosen))
+    filter_setup = setup.FilterSetup(process_noise=noise, attitude_sigma=1e-3, bias_sigma=1e-4)
+    (tmp_path / "turning.toml").write_text(scenarios.scenario_to_toml(scenario))
+    (tmp_path / "filter.toml").write_text(setup.to_toml(filter_setup))
     said = run("covariance", "turning.toml", "--filter", "filter.toml")
 
     def skew(v):

@@ -83,8 +83,8 @@ def recorded(draw) -> ImuRecord:
 @few
 @given(recorded(), texts, st.integers(0, 2**62))
 def test_a_record_goes_through_hdf5_to_the_last_bit(tmp_path, record, text, seed):
-    made = dataclasses.replace(record, origin=records.Origin(seed=seed))
-    recordfiles.write_record(tmp_path / "r.h5", made, attributes={"note": text, "list": ["a", text]})
+    seeded = dataclasses.replace(record, origin=records.Origin(seed=seed))
+    recordfiles.write_record(tmp_path / "r.h5", seeded, attributes={"note": text, "list": ["a", text]})
     back = recordfiles.read_record(tmp_path / "r.h5")
     assert not differing(record, back)
     assert back.origin.seed == seed
@@ -147,7 +147,7 @@ def test_without_process_noise_and_with_small_errors_the_filter_is_batch_least_s
         b /= np.linalg.norm(b, axis=1, keepdims=True)
         time = dt * np.arange(1, n + 1)
         sensors.append(series_of(f"s{k}", "direction", time, b, reference, sigma))
-        for one, t in zip(b, time, strict=True):
+        for direction, t in zip(b, time, strict=True):
             # b = exp(-δθ) r = r + r × δθ; of the gyro's increments, all zero, the filter takes its bias: δθ(t) = δθ(0) - t δb.
             skew = np.array(
                 [
@@ -157,20 +157,20 @@ def test_without_process_noise_and_with_small_errors_the_filter_is_batch_least_s
                 ]
             )
             rows.append(np.hstack([skew, -t * skew]))
-            values.append(one - reference)
+            values.append(direction - reference)
             weights.append((np.eye(3) - np.outer(reference, reference)) / sigma**2)
     information = sum(H.T @ W @ H for H, W in zip(rows, weights, strict=True))
     solution = np.linalg.solve(information, sum(H.T @ W @ z for H, W, z in zip(rows, weights, values, strict=True)))
     record = ImuRecord(time=dt * np.arange(n + 1), increments=np.zeros((n, 3)), vectors=tuple(sensors))
     start = estimation.State(attitude=np.array([1.0, 0.0, 0.0, 0.0]), bias=np.zeros(3), covariance=P0)
     noise = estimation.ProcessNoise(angle_random_walk=1e-14, rate_random_walk=1e-14)
-    found = estimation.run(record, noise, start, full_covariance=True)
+    estimate = estimation.run(record, noise, start, full_covariance=True)
     moved = np.eye(6)
     moved[:3, 3:] = -n * dt * np.eye(3)
     covariance = moved @ np.linalg.inv(information) @ moved.T
     scale = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(
-        found.covariance[-1] / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=2e-3
+        estimate.covariance[-1] / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=2e-3
     )
-    error = np.concatenate([quaternion.log(found.attitude[-1]), found.bias[-1]])
+    error = np.concatenate([quaternion.log(estimate.attitude[-1]), estimate.bias[-1]])
     np.testing.assert_allclose(error / scale, (moved @ solution) / scale, atol=5e-3)

@@ -233,9 +233,9 @@ def test_a_csv_of_many_columns_is_read(tmp_path):
     extra = 50_000
     rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
     path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
-    found = []
-    assert processor_seconds(lambda: found.append(recordings.read(path))) < 3.0
-    assert found[0].rate.shape == (3, 3)
+    captured = []
+    assert processor_seconds(lambda: captured.append(recordings.read(path))) < 3.0
+    assert captured[0].rate.shape == (3, 3)
 
 
 # --------------------------------------------------------------------------------------------------------------------- links
@@ -454,7 +454,9 @@ def test_beside_another_thread_a_new_process_tries_it(tmp_path, monkeypatch, sta
         file["values"] = np.zeros(3)
     real, tried = reading._status_of_process, []
     monkeypatch.setattr(reading, "_status_of_fork", None)
-    monkeypatch.setattr(reading, "_status_of_process", lambda *given: tried.append(given[0]) or status or real(*given))
+    monkeypatch.setattr(
+        reading, "_status_of_process", lambda *arguments: tried.append(arguments[0]) or status or real(*arguments)
+    )
     done = threading.Event()
     other = threading.Thread(target=done.wait)
     other.start()
@@ -552,7 +554,7 @@ def test_of_two_processes_on_one_output_the_second_is_reported_who_writes(known,
     with pytest.raises(InputError, match=r"runs\.h5 is being written by another process; wait for it, or"):
         campaign.run(plan, path, runs=4)
     assert time.monotonic() - begun < 5.0
-    assert [one.name for one in tmp_path.iterdir() if "runs" in one.name] == [".runs.h5.lock"]
+    assert [file.name for file in tmp_path.iterdir() if "runs" in file.name] == [".runs.h5.lock"]
     other.kill()
     other.communicate()
     with (

@@ -19,7 +19,7 @@ FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
 
 
 @pytest.fixture(scope="module")
-def made():
+def simulated():
     base = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=6.0, gyro_preset="")
     more = (
         vectors.AttitudeSensor(name="tracker / α", sigma_across=1e-4, sigma_about=3e-4, rate=2.0, faults=FAULTS),
@@ -32,13 +32,13 @@ def made():
 
 
 @pytest.fixture
-def written(made, tmp_path):
-    write_record(tmp_path / "record.h5", made[1])
+def written(simulated, tmp_path):
+    write_record(tmp_path / "record.h5", simulated[1])
     return tmp_path / "record.h5"
 
 
-def test_hdf5_reads_back_equal_with_all_that_it_holds(made, tmp_path):
-    scenario, record = made
+def test_hdf5_reads_back_equal_with_all_that_it_holds(simulated, tmp_path):
+    scenario, record = simulated
     path = tmp_path / "deep" / "record.h5"
     write_record(path, record, attributes={"place": "bench", "weight": 2.5})
     back = read_record(path)
@@ -58,9 +58,9 @@ def test_a_damaged_scenario_of_a_file_is_refused_with_its_place(written):
         read_record(written)
 
 
-def test_hdf5_describes_itself(made, tmp_path):
+def test_hdf5_describes_itself(simulated, tmp_path):
     path = tmp_path / "record.h5"
-    write_record(path, made[1])
+    write_record(path, simulated[1])
     with reading.hdf5(path) as file:
         assert "scalar first" in reading.attributes(file)["conventions"]
         datasets = []
@@ -123,20 +123,20 @@ def test_foreign_and_damaged_hdf5_is_refused(written, damage, message):
         read_record(written)
 
 
-def test_a_failed_write_leaves_the_old_file(made, tmp_path):
+def test_a_failed_write_leaves_the_old_file(simulated, tmp_path):
     path = tmp_path / "record.h5"
-    write_record(path, made[1])
+    write_record(path, simulated[1])
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        write_record(path, made[1], attributes={"thing": object()})
+        write_record(path, simulated[1], attributes={"thing": object()})
     with pytest.raises(InputError, match="choose another name"):
-        write_record(path, made[1], attributes={"seed": 3})
+        write_record(path, simulated[1], attributes={"seed": 3})
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["record.h5"]
 
 
-def test_missing_samples_of_every_kind_go_through_a_file(made, tmp_path):
-    record = made[1]
+def test_missing_samples_of_every_kind_go_through_a_file(simulated, tmp_path):
+    record = simulated[1]
     holed = []
     for series in record.vectors:
         name = "vector_b" if series.attitude is None else "attitude"
@@ -157,13 +157,13 @@ def test_missing_samples_of_every_kind_go_through_a_file(made, tmp_path):
         ("/", "conventions", "quaternions scalar last", r"follows other conventions \(quaternions scalar last\)"),
     ],
 )
-def test_units_and_conventions_that_contradict_are_refused(made, tmp_path, where, name, value, words):
+def test_units_and_conventions_that_contradict_are_refused(simulated, tmp_path, where, name, value, words):
     path = tmp_path / "record.h5"
-    write_record(path, made[1])
+    write_record(path, simulated[1])
     with changed(path) as file:
         file[where].attrs[name] = value
     with pytest.raises(InputError, match=words):
         read_record(path)
     with changed(path) as file:
         del file[where].attrs[name]
-    assert not differing(read_record(path), made[1])
+    assert not differing(read_record(path), simulated[1])

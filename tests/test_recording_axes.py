@@ -68,10 +68,10 @@ def angles(path) -> np.ndarray:
     return np.array([[float(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll", "heading")] for row in rows])
 
 
-def off(found: np.ndarray, expected: np.ndarray) -> float:
+def off(actual: np.ndarray, expected: np.ndarray) -> float:
     """Largest difference of angles after the first 5 s, degrees."""
-    found, expected = found[250:], expected[-len(found) :][250:]
-    return float(np.abs((found - expected + 180.0) % 360.0 - 180.0).max())
+    actual, expected = actual[250:], expected[-len(actual) :][250:]
+    return float(np.abs((actual - expected + 180.0) % 360.0 - 180.0).max())
 
 
 def true_angles(time: np.ndarray) -> np.ndarray:
@@ -159,17 +159,17 @@ def test_a_unit_that_does_not_rest_says_nothing():
 def test_axes_of_one_sensor_and_of_the_whole_unit():
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     right = walk()
-    found = recordings.with_axes(with_samples(right, magnetic_field=turn.T), {"magnetometer": "y,-x,z"})
-    np.testing.assert_array_equal(found.magnetic_field, right.magnetic_field)
-    np.testing.assert_array_equal(found.rate, right.rate)
+    recording = recordings.with_axes(with_samples(right, magnetic_field=turn.T), {"magnetometer": "y,-x,z"})
+    np.testing.assert_array_equal(recording.magnetic_field, right.magnetic_field)
+    np.testing.assert_array_equal(recording.rate, right.rate)
     reference = np.roll(attitude(right.time).as_quat(), 1, axis=1)
-    found = recordings.with_axes(Recording(**{**vars(right), "true_attitude": reference}), "y,-x,z")
-    np.testing.assert_allclose(found.rate, right.rate @ turn.T)
+    recording = recordings.with_axes(Recording(**{**vars(right), "true_attitude": reference}), "y,-x,z")
+    np.testing.assert_allclose(recording.rate, right.rate @ turn.T)
     expected = attitude(right.time).as_matrix() @ turn.T
     np.testing.assert_allclose(
-        Rotation.from_quat(np.roll(found.true_attitude, -1, axis=1)).as_matrix(), expected, atol=1e-12
+        Rotation.from_quat(np.roll(recording.true_attitude, -1, axis=1)).as_matrix(), expected, atol=1e-12
     )
-    assert found.remarks == ("Body axes read as (y,-x,z).",)
+    assert recording.remarks == ("Body axes read as (y,-x,z).",)
 
 
 @pytest.mark.parametrize("bad", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,z", "--x,y,z"])

@@ -70,12 +70,12 @@ def bag(tmp_path):
                 full = ("std_msgs/msg/" if kind == "String" else "sensor_msgs/msg/") + kind
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, full, typestore=store)
-                made = message(store, kind, stamp, frame, numbers, ros1)
-                raw = store.serialize_ros1(made, full) if ros1 else store.serialize_cdr(made, full)
+                instance = message(store, kind, stamp, frame, numbers, ros1)
+                raw = store.serialize_ros1(instance, full) if ros1 else store.serialize_cdr(instance, full)
                 writer.write(connections[topic], START + 1000 * k, raw)
         if suffix in ("bag", "folder"):
             return path
-        return next(one for one in path.iterdir() if one.suffix == f".{suffix}")
+        return next(file for file in path.iterdir() if file.suffix == f".{suffix}")
 
     return write
 
@@ -93,7 +93,7 @@ def test_an_inertial_unit_is_read(bag, suffix, frame):
     recording = read(bag(suffix, content))
     np.testing.assert_array_equal(recording.rate, values[:, :3])
     np.testing.assert_array_equal(recording.specific_force, values[:, 3:])
-    assert recording.clock_ns.tolist() == [one[2] for one in content]
+    assert recording.clock_ns.tolist() == [entry[2] for entry in content]
     assert recording.epoch_ns == START
     assert recording.magnetic_field is None
     assert recording.remarks == ("Topic /imu/data: 40 messages.",)
@@ -276,13 +276,13 @@ def test_the_library_reads_what_is_written(tmp_path, suffix):
     whole = tesla()
     recordings.write(whole, tmp_path / f"x.{suffix}")
     with AnyReader([tmp_path / f"x.{suffix}"]) as reader:
-        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/imu/data_raw"]
-    assert len(found) == 60
-    assert found[7].header.frame_id == "imu_link"
-    assert found[7].header.stamp.sec * 10**9 + found[7].header.stamp.nanosec == whole.clock_ns[7]
-    assert found[7].angular_velocity.y == whole.rate[7, 1]
-    assert found[7].linear_acceleration.z == whole.specific_force[7, 2]
-    assert found[7].orientation_covariance[0] == -1.0
+        messages = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/imu/data_raw"]
+    assert len(messages) == 60
+    assert messages[7].header.frame_id == "imu_link"
+    assert messages[7].header.stamp.sec * 10**9 + messages[7].header.stamp.nanosec == whole.clock_ns[7]
+    assert messages[7].angular_velocity.y == whole.rate[7, 1]
+    assert messages[7].linear_acceleration.z == whole.specific_force[7, 2]
+    assert messages[7].orientation_covariance[0] == -1.0
 
 
 @pytest.mark.parametrize("suffix", ["bag", "mcap"])
@@ -299,9 +299,9 @@ def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(
     estimate = Estimate(time=recording.time[10:], attitude=q, bias=np.zeros((30, 3)), variance=variance)
     recordings.write(estimate, tmp_path / f"out.{suffix}", recording=recording, source=source)
     with AnyReader([tmp_path / f"out.{suffix}"]) as reader:
-        found = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
-    units = [one for topic, one in found if topic == "/imu/data"]
-    assert [one.data for topic, one in found if topic == "/chatter"] == ["hello"]
+        messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    units = [decoded for topic, decoded in messages if topic == "/imu/data"]
+    assert [decoded.data for topic, decoded in messages if topic == "/chatter"] == ["hello"]
     assert units[9].orientation_covariance[0] == -1.0
     np.testing.assert_allclose(units[10].orientation_covariance.reshape(3, 3), np.diag([9.0, 1.0, 4.0]), atol=1e-12)
     assert (units[10].orientation.w, units[10].orientation.z) == (0.5, 0.5)
@@ -331,7 +331,7 @@ def test_commands_read_bags_and_say_the_topic(bag, tmp_path):
     said = CliRunner().invoke(app, ["estimate", str(path), "--out", str(tmp_path / "out")])
     assert said.exit_code == 0, said.output
     assert "Topic /a/imu: 300 messages." in said.output
-    two = bag("mcap", content + [("/b/imu", "Imu", *one[2:]) for one in content], name="two")
+    two = bag("mcap", content + [("/b/imu", "Imu", *entry[2:]) for entry in content], name="two")
     for options, status in (((), 1), (("--topic", "/b/imu"), 0)):
         said = CliRunner().invoke(app, ["integrate", str(two), "--out", str(tmp_path / "i.h5"), *options])
         assert said.exit_code == status, said.output

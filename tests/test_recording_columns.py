@@ -155,8 +155,8 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
         InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; select one, as in `columns={'gx': "
     ):
         read(path)
-    chosen = read(path, columns={"gx": "gyr_x[deg/s]", "gy": "gyr_y", "gz": "gyr_z"})
-    np.testing.assert_allclose(chosen.rate, VALUES[:, 4:7] * DEGREE, rtol=1e-15)
+    recording = read(path, columns={"gx": "gyr_x[deg/s]", "gy": "gyr_y", "gz": "gyr_z"})
+    np.testing.assert_allclose(recording.rate, VALUES[:, 4:7] * DEGREE, rtol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -153,13 +153,13 @@ def test_a_flight_log_uses_the_time_of_the_samples(ulog, monkeypatch):
 
     path, whole = ulog
     log = pyulog.ULog(str(path))
-    data = {one.name: one.data for one in log.data_list}
+    data = {topic.name: topic.data for topic in log.data_list}
     data["vehicle_magnetometer"]["timestamp"] += 20_000
     data["sensor_combined"]["accelerometer_timestamp_relative"][:] = -30_000
-    monkeypatch.setattr(pyulog, "ULog", lambda *given, **options: log)
-    found = read(path)
-    same(found, whole, "magnetic_field")
-    assert "offset by -30 ms from the gyro's stamps" in " ".join(found.remarks)
+    monkeypatch.setattr(pyulog, "ULog", lambda *arguments, **options: log)
+    recording = read(path)
+    same(recording, whole, "magnetic_field")
+    assert "offset by -30 ms from the gyro's stamps" in " ".join(recording.remarks)
 
 
 def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
@@ -167,7 +167,7 @@ def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
     import pyulog
 
     path, whole = ulog
-    data = {one.name: one.data for one in pyulog.ULog(str(path)).data_list}
+    data = {topic.name: topic.data for topic in pyulog.ULog(str(path)).data_list}
     q = np.stack([data["vehicle_attitude"][f"q[{k}]"] for k in range(4)], axis=1)[:, [1, 2, 3, 0]]
     to_enu = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     expected = to_enu @ Rotation.from_quat(q).as_matrix()
@@ -337,8 +337,8 @@ def test_a_folder_of_euroc_is_read_with_its_truth_between_its_stamps(tmp_path, t
     gap = (stamps > at[59]) & (stamps < at[60])
     np.testing.assert_array_equal(known, (stamps >= at[0]) & (stamps <= at[-1]) & ~gap)
     expected = Slerp((at - at[0]) / 1e9, turns)((stamps[known] - at[0]) / 1e9)
-    found = Rotation.from_quat(recording.true_attitude[known][:, [1, 2, 3, 0]])
-    assert (expected * found.inv()).magnitude().max() < 1e-12
+    attitude = Rotation.from_quat(recording.true_attitude[known][:, [1, 2, 3, 0]])
+    assert (expected * attitude.inv()).magnitude().max() < 1e-12
     assert f"Reference of {truth}/data.csv" in recording.remarks[1]
     np.testing.assert_array_equal(read(folder / "mav0").rate, recording.rate)
     reference = read_attitudes(folder)
@@ -356,9 +356,9 @@ def test_a_trajectory_is_a_reference(tmp_path):
         for s, row in zip(stamps.tolist(), q.tolist(), strict=True)
     ]
     path.write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
-    at, found = recordings.read_tum(path)
+    at, attitude = recordings.read_tum(path)
     assert at.tolist() == stamps.tolist()
-    np.testing.assert_allclose(found, q[:, [3, 0, 1, 2]], atol=1e-15)
+    np.testing.assert_allclose(attitude, q[:, [3, 0, 1, 2]], atol=1e-15)
     joined = recordings.with_reference(whole, path)
     assert not np.isnan(joined.true_attitude).any()
     with pytest.raises(InputError, match="is a TUM trajectory, which has no inertial samples"):
@@ -375,9 +375,9 @@ def test_a_trajectory_is_a_reference(tmp_path):
 def test_interpolation_ends_where_the_reference_does():
     stamps = np.array([0.0, 0.05, 0.5])
     q = quaternion.exp(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]))
-    found = trajectories.interpolated(np.array([-0.01, 0.0, 0.025, 0.05, 0.2, 0.5, 0.6]), stamps, q)
-    assert np.isnan(found[:, 0]).tolist() == [True, False, False, True, True, True, True]
-    np.testing.assert_allclose(quaternion.log(found[2]), [0.05, 0, 0], atol=1e-15)
+    attitude = trajectories.interpolated(np.array([-0.01, 0.0, 0.025, 0.05, 0.2, 0.5, 0.6]), stamps, q)
+    assert np.isnan(attitude[:, 0]).tolist() == [True, False, False, True, True, True, True]
+    np.testing.assert_allclose(quaternion.log(attitude[2]), [0.05, 0, 0], atol=1e-15)
 
 
 # --------------------------------------------------------------------------------------------- conversion

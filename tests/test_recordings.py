@@ -203,12 +203,12 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
 
 def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):
     np.save(tmp_path / "rest.npy", np.full((5, 3), 180.0))
-    found = recordings.read_samples(tmp_path / "rest.npy", "gyro", rate=200.0, units={"gyro": "deg/s"})
-    assert found.sample_interval == pytest.approx(0.005)
-    np.testing.assert_allclose(found.values, np.pi)
+    gyro = recordings.read_samples(tmp_path / "rest.npy", "gyro", rate=200.0, units={"gyro": "deg/s"})
+    assert gyro.sample_interval == pytest.approx(0.005)
+    np.testing.assert_allclose(gyro.values, np.pi)
     np.save(tmp_path / "one.npy", np.arange(5.0))  # one axis
-    found = recordings.read_samples(tmp_path / "one.npy", "gyro", rate=200.0, units={"gyro": "rad/s"})
-    np.testing.assert_array_equal(found.values, np.arange(5.0)[:, None])
+    gyro = recordings.read_samples(tmp_path / "one.npy", "gyro", rate=200.0, units={"gyro": "rad/s"})
+    np.testing.assert_array_equal(gyro.values, np.arange(5.0)[:, None])
 
 
 def test_rows_of_times_are_those_of_their_stamps():
@@ -225,11 +225,11 @@ def test_vectors_of_a_record_are_at_their_stamps():
         series_of("accelerometer", "vector", [1.0, 2.5, 4.0], [g, 2.0 * g, 3.0 * g], g, 0.01),
         series_of("magnetometer", "direction", [1.0], [[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 0.01),
     )
-    found = recordings.from_record(ImuRecord(time=time, increments=np.ones((4, 3)), vectors=vectors))
+    recording = recordings.from_record(ImuRecord(time=time, increments=np.ones((4, 3)), vectors=vectors))
     none = np.full(3, np.nan)
-    np.testing.assert_array_equal(found.specific_force, [g, none, none, 3.0 * g])
-    assert found.magnetic_field is None
-    assert "Left out: magnetometer (direction)." in " ".join(found.remarks)
+    np.testing.assert_array_equal(recording.specific_force, [g, none, none, 3.0 * g])
+    assert recording.magnetic_field is None
+    assert "Left out: magnetometer (direction)." in " ".join(recording.remarks)
 
 
 def test_the_magnetometer_of_a_simulated_record_is_in_tesla(tmp_path):
@@ -239,8 +239,8 @@ def test_the_magnetometer_of_a_simulated_record_is_in_tesla(tmp_path):
         motion=motion.rest(), gyro=strapdown.GyroSpec(), sensors=(sensor,), rate=10.0, duration=2.0
     )
     strapdown.write(strapdown.simulate(scenario), tmp_path / "unit.h5")
-    found = recordings.read_samples(tmp_path / "unit.h5", "magnetometer")
-    np.testing.assert_allclose(found.values, np.broadcast_to(field, found.values.shape), atol=1e-8)
+    magnetometer = recordings.read_samples(tmp_path / "unit.h5", "magnetometer")
+    np.testing.assert_allclose(magnetometer.values, np.broadcast_to(field, magnetometer.values.shape), atol=1e-8)
 
 
 @pytest.mark.parametrize("mark", [";", "\t", "|"])
@@ -390,10 +390,10 @@ def test_samples_go_to_the_nearest_stamp_the_closest_of_several():
 
 
 def test_broad_has_microtesla(tmp_path):
-    one = Recording(
+    recording = Recording(
         source="a", time=np.arange(3.0), rate=np.ones((3, 3)), magnetic_field=np.full((3, 3), 0.5), magnetic_unit="G"
     )
-    recordings.write(one, tmp_path / "a.hdf5")
+    recordings.write(recording, tmp_path / "a.hdf5")
     np.testing.assert_allclose(read(tmp_path / "a.hdf5").magnetic_field, 50.0)
     assert read(tmp_path / "a.hdf5").magnetic_unit == "uT"
 
@@ -478,9 +478,9 @@ def test_a_clock_that_counts_from_1970_keeps_its_digits(tmp_path, unit, factor):
     begin, step = 1_750_000_000 * factor, factor // 100
     rows = "".join(f"{begin + step * k},0.1,0.2,0.{k + 1}\n" for k in range(9))
     (tmp_path / "walk.csv").write_text(f"time [{unit}],gx [rad/s],gy,gz\n" + rows)
-    found = recordings.read(tmp_path / "walk.csv")
-    np.testing.assert_allclose(np.diff(found.time), 0.01, rtol=0.0, atol=1e-15)
-    assert found.time[0] == 0.0
+    recording = recordings.read(tmp_path / "walk.csv")
+    np.testing.assert_allclose(np.diff(recording.time), 0.01, rtol=0.0, atol=1e-15)
+    assert recording.time[0] == 0.0
 
 
 def test_a_clock_that_counts_from_the_start_is_left_as_it_is(tmp_path):
@@ -505,10 +505,10 @@ def test_few_repeated_stamps_are_left_out_whatever_their_samples(tmp_path):
     values = np.column_stack([time, np.random.default_rng(1).standard_normal((1000, 3))])
     path = tmp_path / "repeated.csv"
     np.savetxt(path, values, delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
-    found = read(path)
-    np.testing.assert_allclose(found.repeated, [1.99, 4.99, 7.99])
-    assert len(found.time) == 997
-    np.testing.assert_array_equal(found.rate, np.delete(values[:, 1:], [200, 500, 800], axis=0))
+    recording = read(path)
+    np.testing.assert_allclose(recording.repeated, [1.99, 4.99, 7.99])
+    assert len(recording.time) == 997
+    np.testing.assert_array_equal(recording.rate, np.delete(values[:, 1:], [200, 500, 800], axis=0))
     np.savetxt(path, values[195:205], delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
     with pytest.raises(InputError, match="time"):
         read(path)
@@ -529,13 +529,13 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
 def test_stamps_in_whole_milliseconds_have_the_mean_interval():
     """300 Hz and a lost sample: intervals of 3 and 4 ms. The temperature is interpolated over the loss; a burst is no grid."""
     kept = np.delete(np.arange(900), 600)
-    one = Recording(
+    recording = Recording(
         source="log", time=np.rint(1e3 * kept / 300.0) / 1e3, rate=np.ones((899, 3)), temperature=kept * 0.01
     )
-    found = samples.samples_of(one, gaps=True)
-    assert found.sample_interval == pytest.approx(1.0 / 300.0, rel=1e-3)
-    assert np.flatnonzero(np.isnan(found.values[:, 0])).tolist() == [600]
-    np.testing.assert_allclose(found.temperature, 0.01 * np.arange(900))
+    gyro_samples = samples.samples_of(recording, gaps=True)
+    assert gyro_samples.sample_interval == pytest.approx(1.0 / 300.0, rel=1e-3)
+    assert np.flatnonzero(np.isnan(gyro_samples.values[:, 0])).tolist() == [600]
+    np.testing.assert_allclose(gyro_samples.temperature, 0.01 * np.arange(900))
     time = 0.01 * np.arange(100.0)
     time[41:] -= 0.009
     assert samples._grid("log", time)[1].tolist() == list(range(100))

@@ -24,8 +24,8 @@ def random_attitudes(n: int, seed: int = 1) -> np.ndarray:
 def series(name: str, time: np.ndarray, **changes) -> VectorMeasurements:
     vectors = np.random.default_rng(2).standard_normal((len(time), 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    given = {"kind": "direction", "vector_b": vectors, "reference_f": np.array([0.0, 0.0, 1.0]), "sigma": 0.01}
-    return VectorMeasurements(sensor=name, time=time, **(given | changes))
+    fields = {"kind": "direction", "vector_b": vectors, "reference_f": np.array([0.0, 0.0, 1.0]), "sigma": 0.01}
+    return VectorMeasurements(sensor=name, time=time, **(fields | changes))
 
 
 def record(n: int = 12) -> ImuRecord:
@@ -90,9 +90,9 @@ def test_records_are_frozen_and_lists_are_welcome():
     ],
 )
 def test_bad_records_are_refused(changes, words):
-    given = {"time": [0.0, 0.5, 1.0], "increments": np.zeros((2, 3))}
+    fields = {"time": [0.0, 0.5, 1.0], "increments": np.zeros((2, 3))}
     with pytest.raises(InputError, match=words):
-        changes() if callable(changes) else ImuRecord(**(given | changes))
+        changes() if callable(changes) else ImuRecord(**(fields | changes))
 
 
 # ---------------------------------------------------------------------------------------------------- compressing
@@ -193,8 +193,8 @@ def test_estimate_round_trip_is_exact(tmp_path, full):
 
 def test_estimate_file_holds_units_conventions_and_attributes(tmp_path):
     details = {"parameter.sigma": 0.5}
-    given = dataclasses.replace(estimate(full=True), origin=records.Origin(source="test"), details=details)
-    write_estimate(tmp_path / "estimate.h5", given)
+    written = dataclasses.replace(estimate(full=True), origin=records.Origin(source="test"), details=details)
+    write_estimate(tmp_path / "estimate.h5", written)
     with reading.hdf5(tmp_path / "estimate.h5") as file:
         attributes = reading.attributes(file)
         assert attributes["conventions"] == records.CONVENTIONS
@@ -228,13 +228,13 @@ def test_sigma_and_nis():
 
 
 def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
-    given = estimate()
-    truth = Truth.of_reference(given.attitude, np.arange(7) > 3)
-    write_estimate(tmp_path / "e.h5", dataclasses.replace(given, truth=truth))
-    found = read_estimate(tmp_path / "e.h5").truth
-    assert found == truth
-    np.testing.assert_array_equal(found.attitude, given.attitude)
-    assert np.isnan(found.bias).all()
+    written = estimate()
+    truth = Truth.of_reference(written.attitude, np.arange(7) > 3)
+    write_estimate(tmp_path / "e.h5", dataclasses.replace(written, truth=truth))
+    read_truth = read_estimate(tmp_path / "e.h5").truth
+    assert read_truth == truth
+    np.testing.assert_array_equal(read_truth.attitude, written.attitude)
+    assert np.isnan(read_truth.bias).all()
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path):
@@ -331,14 +331,14 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
 )
 def test_an_event_is_described_by_its_kind(kind, words):
     assert re.match(words, str(records.Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
-    one = str(records.Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
-    assert one.endswith("ambiguous: then one was chosen.")
+    text = str(records.Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
+    assert text.endswith("ambiguous: then one was chosen.")
 
 
 def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
     """σ of 1, 2 and 3 ° in the first row, 4, 5 and 6 ° in the second, 7, 8 and 9 ° in the last; of the bias as many °/h."""
     sigma = np.arange(1.0, 10.0).reshape(3, 3)
-    P = [np.diag(np.radians(np.append(one, one / 3600.0)) ** 2) for one in sigma]
+    P = [np.diag(np.radians(np.append(row, row / 3600.0)) ** 2) for row in sigma]
     bias = np.radians([[0, 0, 0], [1, 1, 1], [10, -20, 30]]) / 3600.0
     rows = Estimate.from_arrays([0.0, 1.0, 2.0], [[1, 0, 0, 0]] * 3, P, bias=bias).listing().cells
     assert [tuple(row[1:]) for row in rows] == [
