@@ -26,7 +26,7 @@ from pathlib import Path
 
 CLIENT = """\
 import array, json, os, signal, socket, sys
-signal.signal(signal.SIGINT, signal.SIG_IGN)  # sent to a kernel before it is asked to end
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # sent to a kernel before its end is requested
 call = socket.socket(socket.AF_UNIX)
 call.connect({address!r})
 words = json.dumps({{"arguments": sys.argv[1:], "folder": os.getcwd(), "environment": dict(os.environ)}}).encode()

@@ -13,6 +13,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,13 +68,23 @@ def more_sure(filter_setup: FilterSetup) -> FilterSetup:
 
 
 def compare(
-    name: str, scenario: scenarios.Scenario, filter_setup: FilterSetup, *, runs: int, epochs: int, seed: int
+    name: str,
+    scenario: scenarios.Scenario,
+    filter_setup: FilterSetup,
+    *,
+    runs: int,
+    epochs: int,
+    seed: int,
+    progress: Callable[[str], None],
 ) -> Comparison:
     """Return prediction and Monte Carlo of one filter."""
+    progress(f"{name}: covariance analysis, which is compiled at its first use")
     analysis = covariance.analyse(scenario, filter_setup, epochs=epochs)
     every = (len(scenario.edges) - 1) // filter_setup.integration.samples // epochs
     squares, nees = np.zeros_like(analysis.rms), np.zeros(len(analysis.time))
     for run in range(runs):
+        if run % 20 == 0:
+            progress(f"{name}: run {run + 1} of {runs}")
         record = scenarios.simulate(scenario, seed, run)
         assert record.truth is not None
         draw = generator(seed, run, "initial error").standard_normal(6)
@@ -139,15 +151,20 @@ def main(
     epochs: int = 100,
     seed: int = 1,
     out: str | os.PathLike[str] | None = None,
+    progress: Callable[[str], None] = lambda line: None,
 ) -> Result:
-    """Predict and run; ``duration`` in s, that of the scenario if not given. Figures and table are written to ``out`` if it is given."""
+    """Predict and run; ``duration`` in s, that of the scenario if not given. Figures and table are written to ``out`` if it is given.
+
+    ``progress`` is called with a line for each twenty runs.
+    """
     base = scenarios.load_scenario(scenario)
     if duration is not None:
         base = dataclasses.replace(base, duration=duration)
     matched = setup.FilterSetup.for_scenario(base, attitude_sigma=0.1 * DEGREE, states=False)
     filters = (("matched", matched), ("a quarter of Q", more_sure(matched)))
     comparisons = tuple(
-        compare(name, base, filter_setup, runs=runs, epochs=epochs, seed=seed) for name, filter_setup in filters
+        compare(name, base, filter_setup, runs=runs, epochs=epochs, seed=seed, progress=progress)
+        for name, filter_setup in filters
     )
     if out is None:
         return Result(comparisons=comparisons, figures=())
@@ -168,4 +185,4 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", default="tumbling-satellite", help="name of a built-in scenario, or a TOML file")
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    print(table(main(**vars(parser.parse_args()))))
+    print(table(main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))))

@@ -103,10 +103,10 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
             for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c"))
         ]
         title = f"|{name} error|: quantiles of the runs, and those predicted by the filter"
-        lines = (*quantiles, *predicted)
-        least, largest = (each([each(line.value) for line in lines]) for each in (np.min, np.max))
+        courses = [*quantiles, *predicted]
+        least, largest = (each([each(line.value) for line in courses]) for each in (np.min, np.max))
         log = bool(20.0 * least < largest < 1000.0 * least)  # beyond, the 16 bits of the chart would show as steps
-        charts.append(page.chart(title, f"|{name} error|, {unit}", statistics.time, lines, log=log))
+        charts.append(page.chart(title, f"|{name} error|, {unit}", statistics.time, courses, log=log))
     return charts
 
 
