@@ -163,9 +163,9 @@ class Compiled:
         self.state, self.library, self.program = self.struct(), self._libraries[key], program
 
     def _call(self, name, *arguments):
-        given = [a if not isinstance(a, float) else self.real(a) for a in arguments]
-        given = [(self.real * len(a))(*a) if isinstance(a, list | tuple | np.ndarray) else a for a in given]
-        return getattr(self.library, f"strapdown_{name}")(ctypes.byref(self.state), *given)
+        values = [a if not isinstance(a, float) else self.real(a) for a in arguments]
+        values = [(self.real * len(a))(*a) if isinstance(a, list | tuple | np.ndarray) else a for a in values]
+        return getattr(self.library, f"strapdown_{name}")(ctypes.byref(self.state), *values)
 
     def init(self, attitude):
         return self._call("init", attitude)
@@ -208,7 +208,7 @@ def samples(record, kinds):
     for i, series in enumerate(record.vectors):
         values = series.attitude if kinds[i] == "attitude" else series.vector_b
         order += [(t, i, v) for t, v in zip(series.time.tolist(), values.tolist(), strict=True)]
-    order.sort(key=lambda one: one[:2])
+    order.sort(key=lambda entry: entry[:2])
     k = 0
     for edge, before, increment in zip(
         record.time[1:].tolist(), record.time.tolist(), record.increments.tolist(), strict=False
@@ -232,10 +232,10 @@ def fed(f, rows, start):
 
 
 def node():
-    found = shutil.which("node")
-    if found is None:
+    path = shutil.which("node")
+    if path is None:
         pytest.skip("no node on this machine")
-    return found
+    return path
 
 
 FEED = """
@@ -261,8 +261,8 @@ def fed_javascript(program, folder, rows, start):
     for name, text in javascript.files(program, "test").items():
         (folder / name).write_text(text, encoding="utf-8")
     (folder / "feed.mjs").write_text(FEED, encoding="utf-8")
-    given = {"rows": rows, "start": list(start), "names": [sensor.name for sensor in program.sensors]}
-    (folder / "rows.json").write_text(json.dumps(given), encoding="utf-8")
+    inputs = {"rows": rows, "start": list(start), "names": [sensor.name for sensor in program.sensors]}
+    (folder / "rows.json").write_text(json.dumps(inputs), encoding="utf-8")
     run = subprocess.run([node(), "feed.mjs"], cwd=folder, check=True, capture_output=True, text=True)
     numbers, statuses = json.loads(run.stdout)
     return np.array(numbers), statuses

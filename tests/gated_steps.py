@@ -136,7 +136,7 @@ def linearize(
 ) -> Linearization:
     """Return a measurement linearised at the state after its update, from 120° to either side too while the attitude is unknown."""
     zero = np.zeros(len(P))
-    seen = first = Linearization(
+    linearization = first = Linearization(
         attitude=attitude, others=others, covariance=P, prior=zero, rows=model(attitude, others)
     )
     if passes == 1:
@@ -145,20 +145,20 @@ def linearize(
     tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     done, trials = 1, 0
     while True:
-        step, size = seen.correction(robust)
-        start = seen
+        step, size = linearization.correction(robust)
+        start = linearization
         converged = size < tolerance
         if converged or done >= passes:
-            seen = seen if converged else replace(first, converged=False)
-            if seen.acceptable(threshold) or trials == 2 or not unknown:
-                return seen
+            linearization = linearization if converged else replace(first, converged=False)
+            if linearization.acceptable(threshold) or trials == 2 or not unknown:
+                return linearization
             trials += 1
             done, start, step = 0, first, zero.copy()
             step[:3] = math.copysign(TURN_ASIDE, trials - 1.5) * least_certain_axis(P)
         now = quaternion.normalize(quaternion.multiply(start.attitude, quaternion.exp(step[:3])))
         now_others = turning(start.attitude, now)[3:, 3:] @ (start.others + step[3:])
         moved, prior = prior_at(first, now, now_others, turning)
-        seen = Linearization(
+        linearization = Linearization(
             attitude=now, others=now_others, covariance=moved, prior=prior, rows=model(now, now_others)
         )
         done += 1
@@ -215,8 +215,8 @@ class Supervision:
     @property
     def events(self) -> tuple[Event, ...]:
         """Recoveries and lock-outs up to now, in order of time."""
-        found = gate_events(self.recoveries, self.lock_outs, self.sensors)
-        return tuple(sorted(found, key=lambda event: event.start))
+        events = gate_events(self.recoveries, self.lock_outs, self.sensors)
+        return tuple(sorted(events, key=lambda event: event.start))
 
     def judge(self, filter: Any, sensor: str, outcome: int, update: Callable[[Any], int]) -> None:
         """Count the outcome of a measurement for a filter; ``update`` updates the restart candidate with it."""
@@ -322,25 +322,26 @@ class GatedStepFilter(StepFilter):
         others = np.concatenate([self.bias, self.values])
         rows = partial(self._rows_at, measurement, self._model(sensor, measurement.kind))
         turning = self._motion.turning_matrix
-        seen = linearize(rows, self.attitude, others, self.P, turning, self._passes, threshold, self.robust)
-        self.nis = seen.nis
-        self.dim_z = len(seen.rows.residual)
+        linearization = linearize(rows, self.attitude, others, self.P, turning, self._passes, threshold, self.robust)
+        self.nis = linearization.nis
+        self.dim_z = len(linearization.rows.residual)
         unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)
-        if unknown or not seen.acceptable(threshold):
+        if unknown or not linearization.acceptable(threshold):
             self.weight = 0.0
-            self._show_refused(seen, measurement.length)
+            self._show_refused(linearization, measurement.length)
             return PASSED_OVER if unknown else REFUSED
-        self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
-        self._accept(seen, measurement.length)
+        self.weight = 1.0 if self.robust is None else linearization.weight(self.robust)
+        self._accept(linearization, measurement.length)
         return ACCEPTED
 
-    def _accept(self, seen: Linearization, unit: float) -> None:
+    def _accept(self, linearization: Linearization, unit: float) -> None:
         """Correct the state at which a measurement is linearised by filterpy's update; the rows are multiplied by ``unit``."""
-        self.attitude, self.bias, self.values = seen.attitude, seen.others[:3], seen.others[3:]
-        self.P, self.x = seen.covariance, seen.prior
-        H, R = unit * seen.rows.H, seen.rows.noise * (unit**2 / self.weight)
+        self.attitude = linearization.attitude
+        self.bias, self.values = linearization.others[:3], linearization.others[3:]
+        self.P, self.x = linearization.covariance, linearization.prior
+        H, R = unit * linearization.rows.H, linearization.rows.noise * (unit**2 / self.weight)
         filterpy.kalman.ExtendedKalmanFilter.update(
-            self, unit * seen.rows.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R
+            self, unit * linearization.rows.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R
         )
         correction, self.x = self.x, np.zeros(len(self.x))
         self._reset(correction, self.P, far=self._passes > 1 and bool(np.trace(self.P[:3, :3]) > KNOWN))
@@ -361,10 +362,10 @@ class GatedStepFilter(StepFilter):
         self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
         self.P = P
 
-    def _show_refused(self, seen: Linearization, unit: float) -> None:
+    def _show_refused(self, linearization: Linearization, unit: float) -> None:
         """Set residual and covariance of a refused measurement."""
-        self.z, self.y = unit * seen.rows.residual, unit * seen.innovation
-        self.S = unit**2 * (seen.predicted + seen.rows.noise)
+        self.z, self.y = unit * linearization.rows.residual, unit * linearization.innovation
+        self.S = unit**2 * (linearization.predicted + linearization.rows.noise)
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""

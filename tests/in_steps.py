@@ -52,7 +52,7 @@ def run(record, process_noise, initial, error_states=(), **options):
     f = GatedStepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
     events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
     events = [event for event in events if event[0] >= record.time[0]]
-    rows, seen = [], {sensor: [] for sensor in sensors}
+    rows, updates = [], {sensor: [] for sensor in sensors}
 
     def give_until(end):
         now = f.time
@@ -64,7 +64,7 @@ def run(record, process_noise, initial, error_states=(), **options):
             series, skipped = record.vectors[i], sum(f.skipped.values())
             f.update(series, k)
             if sum(f.skipped.values()) == skipped:
-                seen[series.sensor].append((f.nis, f.weight, f.y, f.S))
+                updates[series.sensor].append((f.nis, f.weight, f.y, f.S))
         return now
 
     whole, delta = 0.0, np.zeros(3)
@@ -84,9 +84,11 @@ def run(record, process_noise, initial, error_states=(), **options):
         bias=bias,
         values=dict(zip([block.name for block in error_states], np.split(values, ends, axis=1), strict=False)),
         whole_covariance=P,
-        nis={sensor: np.array([one[0] for one in found]) for sensor, found in seen.items()},
-        weight={sensor: np.array([one[1] for one in found]) for sensor, found in seen.items()},
-        whitened={sensor: np.array([whitened(*one[2:]) for one in found]) for sensor, found in seen.items()},
+        nis={sensor: np.array([update[0] for update in history]) for sensor, history in updates.items()},
+        weight={sensor: np.array([update[1] for update in history]) for sensor, history in updates.items()},
+        whitened={
+            sensor: np.array([whitened(*update[2:]) for update in history]) for sensor, history in updates.items()
+        },
         refused={sensor: f.refused.get(sensor, 0) for sensor in sensors},
         skipped={sensor: f.skipped.get(sensor, 0) for sensor in sensors},
         events=tuple(sorted([*estimation.gaps(record), *f.events], key=lambda event: event.start)),

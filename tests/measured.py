@@ -18,7 +18,7 @@ STAR = np.array([0.6, 0.64, 0.48])
 def waves(*each, **more) -> motion.HarmonicRates:
     """Return a motion from amplitude, frequency and phase of each harmonic of its rate."""
     names = ("amplitude", "frequency", "phase")
-    harmonics = [motion.Harmonic(**dict(zip(names, one, strict=False))) for one in each]
+    harmonics = [motion.Harmonic(**dict(zip(names, values, strict=False))) for values in each]
     return motion.HarmonicRates(harmonics=harmonics, **more)
 
 

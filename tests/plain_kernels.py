@@ -16,23 +16,23 @@ KERNELS = "strapdown.kernels"
 @cache
 def called(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Callable[..., Any]:
     """Return a compiled function that calls a helper of a kernel: helpers themselves cannot be called from Python."""
-    made = helper(function, parts)
+    compiled = helper(function, parts)
     wrapped = numba.njit(pipeline_class=KernelCompiler, _nrt=False)
-    return wrapped(lambda *arguments: made(*arguments))  # noqa: PLW0108 (the lambda is what gets the wrapper)
+    return wrapped(lambda *arguments: compiled(*arguments))  # noqa: PLW0108 (the lambda is what gets the wrapper)
 
 
 def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:
     """Return the function that :func:`strapdown.kernels.machine.compiled` would compile, its open functions bound to ``parts``."""
-    made: dict[FunctionType, FunctionType] = {}
+    copies: dict[FunctionType, FunctionType] = {}
 
-    def bound(one: FunctionType) -> FunctionType:
-        if one not in made:
-            names = dict(one.__globals__)
-            made[one] = FunctionType(one.__code__, names, one.__name__, one.__defaults__)
-            for name in _names(one.__code__):
+    def bound(original: FunctionType) -> FunctionType:
+        if original not in copies:
+            names = dict(original.__globals__)
+            copies[original] = FunctionType(original.__code__, names, original.__name__, original.__defaults__)
+            for name in _names(original.__code__):
                 value = names.get(name)
                 if isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
-                    names[name] = bound(_defined(name, value, one, parts))
-        return made[one]
+                    names[name] = bound(_defined(name, value, original, parts))
+        return copies[original]
 
     return bound(function) if parts else function

@@ -58,15 +58,15 @@ def recording(duration: float = 30.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0),
     attitude = path(time - 100.0)
     random = np.random.default_rng(1)
 
-    def seen(fixed: list[float], size: float) -> np.ndarray:
+    def in_body(fixed: list[float], size: float) -> np.ndarray:
         return attitude.inv().apply(np.array(fixed)) + size * random.standard_normal((len(time), 3))
 
     return Recording(
         source="known truth",
         time=time,
         rate=rates(time - 100.0) + bias + 0.01 * noise * random.standard_normal((len(time), 3)),
-        specific_force=seen([0.0, 0.0, 9.81], 0.1 * noise),
-        magnetic_field=seen([0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)], 0.5 * noise),
+        specific_force=in_body([0.0, 0.0, 9.81], 0.1 * noise),
+        magnetic_field=in_body([0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)], 0.5 * noise),
         true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
     )
 
@@ -84,7 +84,7 @@ def rows_of(recording: Recording, rows: slice | np.ndarray) -> Recording:
     return dataclasses.replace(recording, **{name: getattr(recording, name)[rows] for name in names})
 
 
-MOTIONS = [pytest.param(one, marks=pytest.mark.slow if one == "vessel" else []) for one in ahrs.MOTIONS]
+MOTIONS = [pytest.param(name, marks=pytest.mark.slow if name == "vessel" else []) for name in ahrs.MOTIONS]
 """The filter of a vessel takes 12 s to compile."""
 
 
@@ -149,9 +149,9 @@ def test_how_the_unit_is_mounted_and_the_unit_of_the_field_do_not_matter():
     names = ("rate", "specific_force", "magnetic_field")
     turned = dataclasses.replace(plain, **{name: mounting.inv().apply(getattr(plain, name)) for name in names})
     scaled = dataclasses.replace(plain, magnetic_field=1e-6 * plain.magnetic_field)
-    found = ahrs.estimate(plain).estimate.attitude
+    attitude = ahrs.estimate(plain).estimate.attitude
     for other, q in ((turned, np.roll(mounting.as_quat(), 1)), (scaled, quaternion.IDENTITY)):
-        expected = quaternion.multiply(found, q)
+        expected = quaternion.multiply(attitude, q)
         assert quaternion.angle_between(ahrs.estimate(other).estimate.attitude, expected).max() < 1e-9
 
 
@@ -173,7 +173,7 @@ def test_half_the_rate_gives_the_same_within_the_trapezoid_rule(parameters):
     """The weight of a second of measurements does not depend on the recording's rate."""
     plain = recording(60.0, bias=(0.005, 0.0, 0.0), noise=0.0)
     half = rows_of(plain, slice(None, None, 2))
-    whole, sparse = (ahrs.estimate(one, parameters, latency=0.0).estimate for one in (plain, half))
+    whole, sparse = (ahrs.estimate(samples, parameters, latency=0.0).estimate for samples in (plain, half))
     # Spans at rest end a sample apart, and the bias is measured there.
     later = slice(120, None)
     assert quaternion.angle_between(whole.attitude[::2][later], sparse.attitude[later]).max() < 0.05 * DEGREE
@@ -182,9 +182,9 @@ def test_half_the_rate_gives_the_same_within_the_trapezoid_rule(parameters):
 
 def test_a_heading_stands_at_the_end_of_its_interval():
     """Of samples at 10 ms and headings gathered over 0.15 s, each has the last stamp before a multiple of that."""
-    found = ahrs.estimate(recording(20.0, noise=0.0), latency=0.0)
-    since = found.estimate.innovations["magnetometer"].time - found.recording.time[0]
-    interval = float(np.diff(found.recording.time).mean())
+    result = ahrs.estimate(recording(20.0, noise=0.0), latency=0.0)
+    since = result.estimate.innovations["magnetometer"].time - result.recording.time[0]
+    interval = float(np.diff(result.recording.time).mean())
     assert len(since) > 100
     assert np.all((-since % 0.15)[:-1] < interval + 1e-9)
     np.testing.assert_allclose(np.diff(since)[:-1], 0.15, atol=1e-9)
@@ -202,10 +202,10 @@ def disturbed(length: float, turn: float = 40.0) -> Recording:
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_disturbance_of_the_field_is_seen_in_its_strength_and_dip(smooth, monkeypatch):
-    found = ahrs.estimate(disturbed(15.0), latency=0.0, smooth=smooth, full_covariance=True)
-    errors = reference_errors(found.estimate.attitude, found.recording.true_attitude)
-    up = quaternion.to_matrix(found.estimate.attitude)[:, 2, :]
-    sigma = np.sqrt(np.einsum("ki,kij,kj->k", up, found.estimate.covariance[:, :3, :3], up))
+    result = ahrs.estimate(disturbed(15.0), latency=0.0, smooth=smooth, full_covariance=True)
+    errors = reference_errors(result.estimate.attitude, result.recording.true_attitude)
+    up = quaternion.to_matrix(result.estimate.attitude)[:, 2, :]
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", up, result.estimate.covariance[:, :3, :3], up))
     assert errors.heading.max() < 3.0 * DEGREE
     assert np.all(errors.heading[300:] < 3.0 * sigma[300:])
     # without that weight
@@ -224,20 +224,20 @@ def with_iron() -> Recording:
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_hard_iron_is_estimated_as_the_unit_turns(smooth):
-    found = ahrs.estimate(with_iron(), latency=0.0, smooth=smooth)
-    np.testing.assert_allclose(found.hard_iron, IRON, atol=0.7)
+    result = ahrs.estimate(with_iron(), latency=0.0, smooth=smooth)
+    np.testing.assert_allclose(result.hard_iron, IRON, atol=0.7)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_heading_is_better_for_it(smooth, monkeypatch):
     shifted = with_iron()
-    found = ahrs.estimate(shifted, latency=0.0, smooth=smooth)
+    result = ahrs.estimate(shifted, latency=0.0, smooth=smooth)
     without = dataclasses.replace(ahrs.HAND_HELD, hard_iron_sigma=0.0)
     monkeypatch.setattr(hard_iron, "FEIGNED", 1e9)
     as_it_is = ahrs.estimate(shifted, without, latency=0.0, smooth=smooth)
     assert not as_it_is.hard_iron.any()
-    assert worst(found, after=30.0)["heading"] < 0.7 * worst(as_it_is, after=30.0)["heading"]
+    assert worst(result, after=30.0)["heading"] < 0.7 * worst(as_it_is, after=30.0)["heading"]
 
 
 @pytest.mark.parametrize(("capacity", "tolerance"), [(1024, 1e-15), (128, 0.25)])
@@ -273,9 +273,9 @@ def test_after_a_dropout_the_field_before_it_is_forgotten():
     whole = in_a_hurry(30.0)
     part = rows_of(whole, (whole.time < 120.0) | (whole.time > 120.5))
     error = quaternion.angle_between(ahrs.estimate(part, latency=0.0).estimate.attitude, part.true_attitude) / DEGREE
-    lost, found = (part.time > 120.0) & (part.time < 120.6), part.time > 122.5
+    lost, recovered = (part.time > 120.0) & (part.time < 120.6), part.time > 122.5
     assert error[lost].max() > 35.0  # the rotation over the dropout is unknown
-    assert np.sqrt(np.mean(error[found] ** 2)) < 1.5
+    assert np.sqrt(np.mean(error[recovered] ** 2)) < 1.5
 
 
 def test_the_smoother_recovers_the_attitude_of_a_start_in_motion(monkeypatch):
@@ -298,7 +298,7 @@ def test_a_wrong_field_at_the_very_start_is_no_disturbance_later():
     first = plain.time < plain.time[0] + 0.03
     wrong = Rotation.from_rotvec(0.5 * up[first]).apply(plain.magnetic_field[first])
     broken = dataclasses.replace(plain, magnetic_field=np.concatenate([wrong, plain.magnetic_field[~first]]))
-    vectors = [ahrs.prepare(one, ahrs.HAND_HELD).record.vectors[1] for one in (plain, broken)]
+    vectors = [ahrs.prepare(samples, ahrs.HAND_HELD).record.vectors[1] for samples in (plain, broken)]
     after = vectors[0].time > plain.time[0] + 3.0
     assert np.median(vectors[1].sigma[after][:12] / vectors[0].sigma[after][:12]) < 1.1
 
@@ -308,7 +308,7 @@ def test_the_steeper_the_field_the_less_it_says():
     flat = recording(20.0)
     there = [0.0, 50.0, 0.0]
     level = dataclasses.replace(flat, magnetic_field=quaternion.rotate(quaternion.conjugate(flat.true_attitude), there))
-    sigma = [np.median(ahrs.prepare(one, ahrs.HAND_HELD).record.vectors[1].sigma[:12]) for one in (flat, level)]
+    sigma = [np.median(ahrs.prepare(samples, ahrs.HAND_HELD).record.vectors[1].sigma[:12]) for samples in (flat, level)]
     assert sigma[1] / sigma[0] == pytest.approx(np.cos(DIP), rel=0.05)
 
 
@@ -389,12 +389,12 @@ def test_every_sample_has_an_attitude_wherever_the_rest_is(smooth):
         **{name: np.vstack([getattr(moving, name), samples]) for name, samples in last.items()},
         true_attitude=np.vstack([moving.true_attitude, np.tile(moving.true_attitude[-1], (n, 1))]),
     )
-    found = ahrs.estimate(whole, latency=0.0, smooth=smooth)
-    np.testing.assert_array_equal(found.estimate.time, whole.time)
-    np.testing.assert_allclose(found.estimate.bias[-1], bias, atol=0.1 * DEGREE)
+    result = ahrs.estimate(whole, latency=0.0, smooth=smooth)
+    np.testing.assert_array_equal(result.estimate.time, whole.time)
+    np.testing.assert_allclose(result.estimate.bias[-1], bias, atol=0.1 * DEGREE)
     if smooth:
-        assert worst(found)["total"] < 2.0
-        np.testing.assert_allclose(found.initial.bias, bias, atol=0.15 * DEGREE)
+        assert worst(result)["total"] < 2.0
+        np.testing.assert_allclose(result.initial.bias, bias, atol=0.15 * DEGREE)
 
 
 def test_a_steady_turn_is_not_rest():
@@ -440,14 +440,17 @@ def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0)
     time = np.arange(round(length * RATE)) / RATE
     attitude = START * Rotation.from_rotvec(np.outer(time, np.array(turn) * DEGREE))
     random = np.random.default_rng(5)
-    seen = {
+    vectors = {
         "specific_force": attitude.inv().apply([0.0, 0.0, 9.81]) + 0.02 * random.standard_normal((len(time), 3)),
         "magnetic_field": attitude.inv().apply([0.0, 20.0, -43.0]) + 0.2 * random.standard_normal((len(time), 3)),
     }
     if not field:
-        del seen["magnetic_field"]
+        del vectors["magnetic_field"]
     return Recording(
-        source="quiet", time=time, rate=np.array(rate) * DEGREE + noise * random.standard_normal((len(time), 3)), **seen
+        source="quiet",
+        time=time,
+        rate=np.array(rate) * DEGREE + noise * random.standard_normal((len(time), 3)),
+        **vectors,
     )
 
 
@@ -466,10 +469,10 @@ def test_a_span_without_samples_of_the_accelerometer_is_no_rest():
 
 @pytest.mark.parametrize("rate", [(0.3, -0.2, 0.1), (4.0, -3.0, 2.0)])
 def test_the_mean_rate_at_rest_measures_the_bias_however_large(rate):
-    found = rests_of(quiet_second(rate))
-    np.testing.assert_array_equal(found.last, [199, 399, 599])
-    assert np.all((found.sigma > 0.05 * DEGREE) & (found.sigma < 0.08 * DEGREE))
-    np.testing.assert_allclose(found.rate, np.tile(rate, (3, 1)) * DEGREE, atol=3.0 * found.sigma.max())
+    rests = rests_of(quiet_second(rate))
+    np.testing.assert_array_equal(rests.last, [199, 399, 599])
+    assert np.all((rests.sigma > 0.05 * DEGREE) & (rests.sigma < 0.08 * DEGREE))
+    np.testing.assert_allclose(rests.rate, np.tile(rate, (3, 1)) * DEGREE, atol=3.0 * rests.sigma.max())
     result = ahrs.estimate(quiet_second(rate))
     np.testing.assert_allclose(result.estimate.bias[-1], np.array(rate) * DEGREE, atol=0.15 * DEGREE)
 
@@ -493,9 +496,9 @@ def test_a_long_rest_is_measured_until_it_says_no_more_than_is_known():
     """In closed form: of σ equal to that of the prior the first is used; then it takes r/q seconds until the bias has drifted as far."""
     n = 1000
     time = np.arange(n, dtype=float)
-    found = starting.Rests(np.arange(1, n), np.zeros((n - 1, 3)), np.full(n - 1, 1e-3))
+    rests = starting.Rests(np.arange(1, n), np.zeros((n - 1, 3)), np.full(n - 1, 1e-3))
     parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1e-3 + 1e-9, rate_random_walk=1e-4)
-    kept = starting.informative(found, time, parameters).last
+    kept = starting.informative(rests, time, parameters).last
     assert kept[0] == 1
     assert kept[1] - 1 == pytest.approx(50, abs=1)  # ½σ² + q t = σ²
 
@@ -511,30 +514,30 @@ def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():
         values=np.zeros(2),
     )
     rate, sigma = np.array([0.02, -0.01, 0.03]), 5e-3
-    found = starting.with_rate_at_rest(state, rate, sigma)
+    posterior = starting.with_rate_at_rest(state, rate, sigma)
     H = np.eye(8)[3:6]
     expected = np.linalg.inv(np.linalg.inv(state.covariance) + H.T @ H / sigma**2)
     change = expected @ H.T @ rate / sigma**2
-    np.testing.assert_allclose(found.bias, change[3:6], atol=1e-12)
-    np.testing.assert_allclose(found.values, change[6:], atol=1e-12)
-    turned = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), found.attitude))
+    np.testing.assert_allclose(posterior.bias, change[3:6], atol=1e-12)
+    np.testing.assert_allclose(posterior.values, change[6:], atol=1e-12)
+    turned = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), posterior.attitude))
     np.testing.assert_allclose(turned, change[:3], atol=1e-12)
     reset = np.eye(8)
     reset[:3, :3] -= 0.5 * np.cross(np.eye(3), change[:3])
-    np.testing.assert_allclose(found.covariance, reset @ expected @ reset.T, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(posterior.covariance, reset @ expected @ reset.T, rtol=1e-3, atol=1e-9)
 
 
 def test_all_rests_are_combined_as_they_drift():
     """Two rests of one σ: the bias at the first sample by least squares over the values of a random walk."""
     time = np.array([0.0, 10.0, 40.0])
-    found = starting.Rests(np.array([1, 2]), np.array([[1e-3] * 3, [4e-3] * 3]), np.array([1e-3, 2e-3]))
+    rests = starting.Rests(np.array([1, 2]), np.array([[1e-3] * 3, [4e-3] * 3]), np.array([1e-3, 2e-3]))
     parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1.0, rate_random_walk=2e-4)
     plain = recording()
-    state = starting.with_all_rests(begun(plain, parameters), found, time, parameters)
+    state = starting.with_all_rests(begun(plain, parameters), rests, time, parameters)
     q = 2e-4**2
     noise = np.array([[1e-6 + 10.0 * q, 10.0 * q], [10.0 * q, 4e-6 + 40.0 * q]])
     weights = np.linalg.solve(noise, np.ones(2))
-    np.testing.assert_allclose(state.bias, weights @ found.rate / weights.sum(), rtol=1e-4)
+    np.testing.assert_allclose(state.bias, weights @ rests.rate / weights.sum(), rtol=1e-4)
     np.testing.assert_allclose(np.diag(state.covariance)[3:6], 1.0 / weights.sum(), rtol=1e-4)
 
 
@@ -545,9 +548,9 @@ def test_the_smoother_finds_the_bias_of_an_accelerometer_that_rest_shows(monkeyp
     """0.27 m/s², of which the first two seconds, at rest, show the vertical part."""
     clean = recording(noise=1.0)
     biased = dataclasses.replace(clean, specific_force=clean.specific_force + np.array([0.15, -0.1, 0.2]))
-    found = worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
+    inclination = worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
     monkeypatch.setattr(starting, "MAX_DEVIATION", np.inf)
-    assert found < 0.5 * worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
+    assert inclination < 0.5 * worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
 
 
 @pytest.mark.parametrize("bias", [(0.0, 0.0, 0.05), (0.0, 0.0, 0.15)])
@@ -596,8 +599,8 @@ def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
     """A filter that bounds the velocity by a hand's takes the curves for tilt; that of a vehicle does not."""
     car = driven()
     own, hand = (
-        worst(ahrs.estimate(car, ahrs.of_motion(one, magnetometer=True)), after=10.0)["inclination"]
-        for one in ("vehicle", "hand")
+        worst(ahrs.estimate(car, ahrs.of_motion(name, magnetometer=True)), after=10.0)["inclination"]
+        for name in ("vehicle", "hand")
     )
     assert own < 3.5 < 3.0 * own < hand
 
@@ -613,8 +616,8 @@ def test_a_vibrating_machine_needs_no_set_of_its_own():
     )
     machine = dataclasses.replace(plain, specific_force=force)
     hand, white = (
-        worst(ahrs.estimate(machine, ahrs.of_motion(one, magnetometer=True), latency=0.0), after=5.0)["inclination"]
-        for one in ("hand", "any")
+        worst(ahrs.estimate(machine, ahrs.of_motion(name, magnetometer=True), latency=0.0), after=5.0)["inclination"]
+        for name in ("hand", "any")
     )
     assert 0.05 < hand < 0.3 < white < 2.0
 
@@ -643,8 +646,8 @@ def on_waves(duration: float = 60.0) -> Recording:
 def test_the_acceleration_of_a_vessel_on_waves_does_not_pass_for_tilt():
     waves = on_waves()
     own, hand = (
-        worst(ahrs.estimate(waves, ahrs.of_motion(one, magnetometer=True)), after=20.0)["inclination"]
-        for one in ("vessel", "hand")
+        worst(ahrs.estimate(waves, ahrs.of_motion(name, magnetometer=True)), after=20.0)["inclination"]
+        for name in ("vessel", "hand")
     )
     assert own < 0.75 * hand
 
@@ -719,32 +722,32 @@ def test_the_turn_over_a_delay_is_that_of_the_trapezoids():
 
 
 def test_a_late_magnetometer_is_made_good(monkeypatch):
-    found = ahrs.estimate(late(field=0.02), latency=0.0)
-    assert found.delays.last_field == pytest.approx(0.02, abs=2e-3)
+    result = ahrs.estimate(late(field=0.02), latency=0.0)
+    assert result.delays.last_field == pytest.approx(0.02, abs=2e-3)
     monkeypatch.setattr(sensor_delays, "_fitted", lambda *_: (0.0, np.inf))
     as_it_is = ahrs.estimate(late(field=0.02), latency=0.0)
     assert as_it_is.delays.last_field == 0.0
-    assert worst(found, after=9.0)["heading"] < 0.5 * worst(as_it_is, after=9.0)["heading"]
+    assert worst(result, after=9.0)["heading"] < 0.5 * worst(as_it_is, after=9.0)["heading"]
 
 
 def test_no_sensor_is_early():
     """A magnetometer ahead of the gyro shows that the gyro is late, by as much at least."""
-    found = ahrs.estimate(late(gyro=0.012, field=-0.012), smooth=True)
-    assert found.delays.last_gyro == pytest.approx(0.012, abs=1e-3)
-    assert worst(found, after=1.0)["total"] < 1.0
+    result = ahrs.estimate(late(gyro=0.012, field=-0.012), smooth=True)
+    assert result.delays.last_gyro == pytest.approx(0.012, abs=1e-3)
+    assert worst(result, after=1.0)["total"] < 1.0
     assert ahrs.estimate(late(gyro=0.012, field=-0.012), smooth=True, latency=0.0).delays.last_gyro == 0.0
 
 
 def test_delays_that_change_are_told_by_their_last_values():
-    found = sensor_delays.Delays(
+    delays = sensor_delays.Delays(
         gyro=np.array([1e-3, 2e-3, 4e-3]),
         sigma=1e-3,
         field=np.array([0.0, -8e-3, -5e-3]),
         field_sigma=2e-3,
         is_specified=True,
     )
-    assert (found.last_gyro, found.last_field) == (4e-3, -5e-3)
-    assert found.words == (
+    assert (delays.last_gyro, delays.last_field) == (4e-3, -5e-3)
+    assert delays.words == (
         "Samples are assumed to be stamped 4 ms late.",
         "The magnetometer's samples come 5.0 ms before the gyro's, σ 2 ms, compensated.",
     )
@@ -752,10 +755,10 @@ def test_delays_that_change_are_told_by_their_last_values():
 
 def test_a_sample_is_the_mean_of_its_interval_where_no_latency_is_given():
     """A gyro that integrates gives what was half a sample ago."""
-    found = ahrs.estimate(late(gyro=0.5 / RATE))
-    assert found.delays.last_gyro == pytest.approx(0.5 / RATE)
-    assert worst(found, after=1.0)["total"] < 0.2  # at first with the error of one sample
-    assert found.delays.sigma > ahrs.estimate(late(), latency=0.0).delays.sigma
+    result = ahrs.estimate(late(gyro=0.5 / RATE))
+    assert result.delays.last_gyro == pytest.approx(0.5 / RATE)
+    assert worst(result, after=1.0)["total"] < 0.2  # at first with the error of one sample
+    assert result.delays.sigma > ahrs.estimate(late(), latency=0.0).delays.sigma
 
 
 @pytest.mark.parametrize("latency", [None, 0.004])
@@ -763,7 +766,7 @@ def test_the_filter_is_causal(latency):
     """What comes later changes nothing of what was said before, delays that are found included."""
     whole = late(gyro=0.004, field=0.015)
     rows = round(20.0 * RATE)
-    first, both = (ahrs.estimate(one, latency=latency) for one in (rows_of(whole, slice(rows)), whole))
+    first, both = (ahrs.estimate(samples, latency=latency) for samples in (rows_of(whole, slice(rows)), whole))
     assert both.delays.last_field == pytest.approx(0.015, abs=1e-3)
     before = slice(0, rows - 100)  # the last step and heading interval end with the record
     np.testing.assert_allclose(both.estimate.attitude[before], first.estimate.attitude[before], atol=1e-12)
@@ -782,23 +785,23 @@ def test_a_latency_that_is_given_is_made_good():
 def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
     bias = np.array([5.0, -4.0, 3.0]) * DEGREE
     plain = recording(12.0, bias=tuple(bias))
-    found, late_by, far = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02, 0.5))
-    used, q = found.recording, found.estimate.attitude
-    seen = found.estimate.bias
-    assert np.abs(seen - bias)[used.time > used.time[0] + 1.1].max() < 0.2 * DEGREE
+    prompt, late_by, far = (ahrs.estimate(plain, latency=latency) for latency in (0.0, 0.02, 0.5))
+    used, q = prompt.recording, prompt.estimate.attitude
+    estimated_bias = prompt.estimate.bias
+    assert np.abs(estimated_bias - bias)[used.time > used.time[0] + 1.1].max() < 0.2 * DEGREE
     # from each step's stamp on, a sample at a time, by SciPy
-    turn = 0.5 * (used.rate[1:] + used.rate[:-1]) - seen[:-1]
+    turn = 0.5 * (used.rate[1:] + used.rate[:-1]) - estimated_bias[:-1]
     by_gyro = Rotation.from_rotvec(turn * np.diff(used.time)[:, None])
-    step = np.searchsorted(found.record.time, used.time, side="right") - 1
+    step = np.searchsorted(prompt.record.time, used.time, side="right") - 1
     same = step[1:] == step[:-1]
     moved = quaternion.log(quaternion.multiply(quaternion.conjugate(q[:-1]), q[1:]))
     assert same.mean() > 0.8
     np.testing.assert_allclose(moved[same], by_gyro.as_rotvec()[same], atol=4e-5)  # without the bias 4e-4
     ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), late_by.estimate.attitude))
-    np.testing.assert_allclose(ahead, 0.02 * (used.rate - seen), atol=1e-4)  # without the bias 2e-3
+    np.testing.assert_allclose(ahead, 0.02 * (used.rate - estimated_bias), atol=1e-4)  # without the bias 2e-3
     ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), far.estimate.attitude))
     assert np.linalg.norm(ahead, axis=1).max() > 0.6
-    np.testing.assert_allclose(ahead, 0.5 * (used.rate - seen), atol=3e-3)
+    np.testing.assert_allclose(ahead, 0.5 * (used.rate - estimated_bias), atol=3e-3)
 
 
 @pytest.mark.parametrize(
@@ -814,13 +817,14 @@ def test_bad_latencies_are_refused(value, words):
 
 def test_all_samples_hold_more_than_those_before(parameters):
     plain = recording(60.0, bias=(0.004, -0.003, 0.002), noise=1.0)
-    found, smoothed = (ahrs.estimate(plain, parameters, smooth=smooth) for smooth in (False, True))
+    filtered, smoothed = (ahrs.estimate(plain, parameters, smooth=smooth) for smooth in (False, True))
     rms = [
-        reference_errors(one.estimate.attitude, one.recording.true_attitude).rms()["total"] for one in (found, smoothed)
+        reference_errors(result.estimate.attitude, result.recording.true_attitude).rms()["total"]
+        for result in (filtered, smoothed)
     ]
     assert rms[1] < 0.8 * rms[0]
-    np.testing.assert_array_equal(found.estimate.time, smoothed.estimate.time)
-    assert np.all(smoothed.estimate.sigma <= found.estimate.sigma * (1.0 + 1e-9))
+    np.testing.assert_array_equal(filtered.estimate.time, smoothed.estimate.time)
+    assert np.all(smoothed.estimate.sigma <= filtered.estimate.sigma * (1.0 + 1e-9))
 
 
 def test_states_of_an_accelerometer_are_in_its_unit():
@@ -840,17 +844,17 @@ def test_beliefs_are_a_setup_that_goes_through_its_file(parameters):
 
 def test_what_a_filter_cannot_estimate_is_part_of_sigma():
     """A timing error of 2 ms along the rate, and iron of 0.4 % over the level part of the field about the vertical."""
-    given, assumed = (ahrs.estimate(late(), latency=one, full_covariance=True) for one in (0.0025, None))
-    rate = given.recording.rate
+    specified, assumed = (ahrs.estimate(late(), latency=latency, full_covariance=True) for latency in (0.0025, None))
+    rate = specified.recording.rate
     along = rate / np.linalg.norm(rate, axis=1, keepdims=True)
     fast = np.linalg.norm(rate, axis=1) > 5.0
-    difference = assumed.estimate.covariance[:, :3, :3] - given.estimate.covariance[:, :3, :3]
+    difference = assumed.estimate.covariance[:, :3, :3] - specified.estimate.covariance[:, :3, :3]
     extra = np.einsum("ki,kij,kj->k", along, difference, along)[fast]
     np.testing.assert_allclose(extra, (2e-3**2 - 3e-4**2) * np.sum(rate[fast] ** 2, axis=1), rtol=1e-6)
     without = ahrs.estimate(
         late(), dataclasses.replace(ahrs.HAND_HELD, iron_sigma=0.0), latency=0.0025, full_covariance=True
     )
-    difference = given.estimate.covariance[:, :3, :3] - without.estimate.covariance[:, :3, :3]
+    difference = specified.estimate.covariance[:, :3, :3] - without.estimate.covariance[:, :3, :3]
     share = np.trace(difference, axis1=1, axis2=2) / (0.004 / np.cos(DIP)) ** 2
     step = int(ahrs.HAND_HELD.step * RATE)
     np.testing.assert_allclose(share[:step], 1.0, rtol=0.1)  # the dip is that of one sample until the first step ends
@@ -860,16 +864,16 @@ def test_what_a_filter_cannot_estimate_is_part_of_sigma():
 @pytest.mark.parametrize("smooth", [False, True])
 def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smooth):
     """In fixed axes, but for the timing error along the rate, it is that of the step."""
-    found = ahrs.estimate(late(), latency=0.0025, full_covariance=True, smooth=smooth)
-    used, estimate = found.recording, found.estimate
+    result = ahrs.estimate(late(), latency=0.0025, full_covariance=True, smooth=smooth)
+    used, estimate = result.recording, result.estimate
     P = estimate.covariance[:, :3, :3]
     np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
     np.testing.assert_array_equal(np.einsum("kii->ki", estimate.covariance), estimate.variance)
     R = quaternion.to_matrix(estimate.attitude)
-    timed = found.delays.sigma**2 * used.rate[:, :, None] * used.rate[:, None, :]
+    timed = result.delays.sigma**2 * used.rate[:, :, None] * used.rate[:, None, :]
     fixed = R @ (P - timed) @ R.transpose(0, 2, 1)
-    step = np.searchsorted(found.record.time, used.time, side="right") - 1
-    begin = np.searchsorted(step, np.arange(len(found.record.time)))
+    step = np.searchsorted(result.record.time, used.time, side="right") - 1
+    begin = np.searchsorted(step, np.arange(len(result.record.time)))
     np.testing.assert_allclose(fixed, fixed[begin][step], atol=1e-12 * np.abs(fixed).max())
     np.testing.assert_array_equal(estimate.bias, estimate.bias[begin][step])
     without = ahrs.estimate(late(), latency=0.0025, smooth=smooth).estimate
@@ -896,14 +900,14 @@ def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share, monkeyp
         heading_share=heading_share,
         heading_by_field=0.0,
     )
-    found = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
-    own = found.parameters.setup
-    blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
-    plain = estimation.run(found.record, own.process_noise, found.initial, blocks, full_covariance=True)
-    rows = np.searchsorted(found.recording.time, plain.time)
-    rate = found.recording.rate[rows]
-    P = found.estimate.covariance[rows, :3, :3] - found.delays.sigma**2 * rate[:, :, None] * rate[:, None, :]
-    R, own_R = quaternion.to_matrix(found.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
+    result = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
+    own = result.parameters.setup
+    blocks = own.states.blocks({series.sensor: series.kind for series in result.record.vectors})
+    plain = estimation.run(result.record, own.process_noise, result.initial, blocks, full_covariance=True)
+    rows = np.searchsorted(result.recording.time, plain.time)
+    rate = result.recording.rate[rows]
+    P = result.estimate.covariance[rows, :3, :3] - result.delays.sigma**2 * rate[:, :, None] * rate[:, None, :]
+    R, own_R = quaternion.to_matrix(result.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
     scaled = R @ P @ R.transpose(0, 2, 1)
     filtered = own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1)
     limit = (3.0 * DEGREE) ** 2 * np.array([1.0, 1.0 / 0.07])
@@ -921,7 +925,7 @@ def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share, monkeyp
     np.testing.assert_allclose(
         scaled / size[:, :, None] / size[:, None], S @ filtered @ S / size[:, :, None] / size[:, None], atol=1e-6
     )
-    beside, with_bias = found.estimate.covariance[rows], S @ own_R @ plain.covariance[:, :3, 3:]
+    beside, with_bias = result.estimate.covariance[rows], S @ own_R @ plain.covariance[:, :3, 3:]
     np.testing.assert_allclose(R @ beside[:, :3, 3:], with_bias, atol=1e-6 * np.abs(with_bias).max())
     np.testing.assert_array_equal(beside[:, 3:, :3], beside[:, :3, 3:].transpose(0, 2, 1))
     np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])
@@ -930,8 +934,8 @@ def test_shares_scale_tilt_and_heading_up_to_their_limits(heading_share, monkeyp
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     whole = hand_held.simulated(1, 0, 20.0)
     moving = hand_held.modified(whole)["no rest"]
-    found, score = hand_held.ours(moving, 0.0)
-    assert np.sqrt(found.initial.covariance[0, 0]) > 6.0 * DEGREE
+    result, score = hand_held.ours(moving, 0.0)
+    assert np.sqrt(result.initial.covariance[0, 0]) > 6.0 * DEGREE
     assert score.coverage[0] > 0.9
     assert score.errors[0] < 15.0 * DEGREE
 
@@ -978,18 +982,18 @@ def test_mean_error_over_the_broad_trials(broad):
 
 def test_the_magnetometer_of_the_broad_trials_is_late(broad):
     """By 11 ms beside the gyro, in every trial by itself to within its σ."""
-    found = np.array([sensor_delays.magnetometer_delay(trial(file)) for file in sorted(broad.glob("*.hdf5"))])
-    assert np.all(np.abs(found[:, 0] - 0.0112) < 3.0 * found[:, 1] + 3e-4)
-    assert np.sum(found[:, 1] < 5e-4) >= 5
+    delays = np.array([sensor_delays.magnetometer_delay(trial(file)) for file in sorted(broad.glob("*.hdf5"))])
+    assert np.all(np.abs(delays[:, 0] - 0.0112) < 3.0 * delays[:, 1] + 3e-4)
+    assert np.sum(delays[:, 1] < 5e-4) >= 5
 
 
 def test_sigma_holds_on_broad_trials(broad):
     """The 95 % regions, as recorded, of the fastest trials, whose delays matter most."""
     for number in ("07", "21"):
         for smooth in (False, True):
-            one = score(next(broad.glob(f"{number}_*.hdf5")), smooth)
-            assert one.coverage[0] > 0.9, (number, smooth, one)
-            assert one.errors[0] < one.sigma < 4.0 * one.errors[0], (number, smooth, one)
+            accuracy = score(next(broad.glob(f"{number}_*.hdf5")), smooth)
+            assert accuracy.coverage[0] > 0.9, (number, smooth, accuracy)
+            assert accuracy.errors[0] < accuracy.sigma < 4.0 * accuracy.errors[0], (number, smooth, accuracy)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
@@ -1004,14 +1008,14 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     """In closed form: of no acceleration, after a turn that is uncertain, and of as much as modelled."""
     steps, interval = 4000, 0.03
     time = interval * np.arange(steps + 1)
-    seen = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.full((steps, 3), 2.0))
+    innovations = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.full((steps, 3), 2.0))
     nothing = np.zeros((steps + 1, 6))
     still = Estimate(
         time=time,
         attitude=np.tile([1.0, 0.0, 0.0, 0.0], (steps + 1, 1)),
         bias=nothing[:, :3],
         variance=nothing + 1.0,
-        innovations={"accelerometer": seen},
+        innovations={"accelerometer": innovations},
     )
     uncertain = np.arange(steps) == 2999
     level = regions.acceleration_level(still, uncertain, interval)
@@ -1020,7 +1024,7 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     variance = regions.scaled_innovations(still, level)["accelerometer"].variance
     own = regions.OWN_SHARE
     np.testing.assert_allclose(variance[:, 0], 2.0 * (own + (1.0 - own) * level[:-1]), rtol=1e-12)
-    moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
+    moved = dataclasses.replace(innovations, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
     np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain, interval), 1.0, rtol=1e-12)
 
@@ -1048,16 +1052,16 @@ def test_disagreement_of_filter_and_smoother_widens_the_tilt_alone(monkeypatch):
     later = plain.specific_force.copy()
     later[len(later) // 2 :] += [0.0, 1.0, 0.0]
     sudden = dataclasses.replace(plain, specific_force=later)
-    found = ahrs.estimate(sudden, smooth=True, full_covariance=True)
+    result = ahrs.estimate(sudden, smooth=True, full_covariance=True)
     share = regions.DISAGREEMENT_SHARE
     monkeypatch.setattr(regions, "DISAGREEMENT_SHARE", 0.0)
     without = ahrs.estimate(sudden, smooth=True, full_covariance=True)
-    R = quaternion.to_matrix(found.estimate.attitude)
-    change = (found.estimate.covariance - without.estimate.covariance)[:, :3, :3]
+    R = quaternion.to_matrix(result.estimate.attitude)
+    change = (result.estimate.covariance - without.estimate.covariance)[:, :3, :3]
     added = np.einsum("kii->ki", R @ change @ R.transpose(0, 2, 1))
-    own = found.parameters.setup
-    blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
-    arguments = found.record, own.process_noise, found.initial, blocks
+    own = result.parameters.setup
+    blocks = own.states.blocks({series.sensor: series.kind for series in result.record.vectors})
+    arguments = result.record, own.process_noise, result.initial, blocks
     smoothed, filtered = (
         Rotation.from_quat(run(*arguments).attitude, scalar_first=True) for run in (estimation.smooth, estimation.run)
     )
@@ -1097,8 +1101,8 @@ def test_an_accelerometer_that_deviates_from_gravity_has_a_less_certain_tilt():
         for factor in (9.80665 / 9.81, 1.05 * 9.80665 / 9.81)
     )
     tilts = []
-    for one in (plain, deviating):
-        result = ahrs.estimate(one, latency=0.0, full_covariance=True)
+    for samples in (plain, deviating):
+        result = ahrs.estimate(samples, latency=0.0, full_covariance=True)
         R = quaternion.to_matrix(result.estimate.attitude)
         P = R @ result.estimate.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
         tilts.append(P[:, 0, 0] + P[:, 1, 1])
@@ -1120,8 +1124,8 @@ def test_the_headings_variance_follows_the_fields_level():
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
-    found = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
-    assert 0.1 < min(found) < max(found) < 0.9, found
+    nis = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
+    assert 0.1 < min(nis) < max(nis) < 0.9, nis
 
 
 def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
@@ -1147,19 +1151,19 @@ def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):
     if not file.exists():
         pytest.skip(f"no x-io sample file in {file.parent}; see its Fusion library's examples")
     values = np.loadtxt(file, delimiter=",", skiprows=1)
-    one = Recording(
+    recording = Recording(
         source=file.name,
         time=values[:, 0],
         rate=values[:, 1:4] * DEGREE,
         specific_force=9.80665 * values[:, 4:7],
         magnetic_field=values[:, 7:10],
     )
-    found = ahrs.estimate(one, full_covariance=True).estimate
-    nose = quaternion.rotate(found.attitude, [1.0, 0.0, 0.0])
+    estimate = ahrs.estimate(recording, full_covariance=True).estimate
+    nose = quaternion.rotate(estimate.attitude, [1.0, 0.0, 0.0])
     heading = np.unwrap(np.arctan2(nose[:, 1], nose[:, 0]))
     turned = heading[-50:].mean() - heading[:50].mean()
-    up = quaternion.to_matrix(found.attitude[-1])[2]
-    sigma = np.sqrt(up @ found.covariance[-1, :3, :3] @ up)
+    up = quaternion.to_matrix(estimate.attitude[-1])[2]
+    sigma = np.sqrt(up @ estimate.covariance[-1, :3, :3] @ up)
     off = abs((turned + np.pi) % (2.0 * np.pi) - np.pi)
     assert off < 4.5 * DEGREE  # 0.3° with half the σ of the hard iron, which costs the other recordings 2 %
     assert off < 3.0 * sigma < 60.0 * DEGREE

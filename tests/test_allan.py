@@ -158,8 +158,8 @@ def times_of_other_threads():
     ]
 
     def of_other_threads():
-        tasks = [one for one in Path("/proc/self/task").iterdir() if int(one.name) != threading.get_native_id()]
-        return sum(int((one / "schedstat").read_text().split()[0]) for one in tasks)
+        tasks = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != threading.get_native_id()]
+        return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks)
 
     times = []
     for call in calls:
@@ -185,8 +185,8 @@ def test_default_taus_and_rounding():
     assert result.taus[0] == 0.5
     assert result.taus[-1] == 333 * 0.5
     assert np.all(np.diff(result.taus) > 0.0)
-    chosen = allan.allan_deviation(np.random.default_rng(1).standard_normal(1000), 0.5, taus=[10.1, 1.0, 9.9])
-    assert_allclose(chosen.taus, [1.0, 10.0])
+    rounded = allan.allan_deviation(np.random.default_rng(1).standard_normal(1000), 0.5, taus=[10.1, 1.0, 9.9])
+    assert_allclose(rounded.taus, [1.0, 10.0])
 
 
 # Confidence
@@ -217,15 +217,15 @@ def test_degrees_of_freedom_against_greenhall(alpha, samples, m):
 @pytest.mark.parametrize("alpha", [1, 0, -1, -2])
 def test_degrees_of_freedom_do_not_jump_where_the_sum_goes_over_from_lags_to_cells(alpha):
     """Beyond m = 1000 cells of several lags are summed; the third differences of a smooth function of m are small."""
-    found = [allan.equivalent_degrees_of_freedom(alpha, 20_000, m) for m in range(998, 1004)]
-    assert np.abs(np.diff(found, n=3)).max() < 1e-5 * found[0]
+    degrees = [allan.equivalent_degrees_of_freedom(alpha, 20_000, m) for m in range(998, 1004)]
+    assert np.abs(np.diff(degrees, n=3)).max() < 1e-5 * degrees[0]
 
 
 @pytest.mark.parametrize("m", [1, 4, 30, 60, 90])
 @pytest.mark.parametrize("alpha", NOISES)
 def test_degrees_of_freedom_by_definition(alpha, m):
-    found = allan.equivalent_degrees_of_freedom(alpha, 200, m)
-    assert_allclose(found, by_definition(alpha, 200, m), rtol=2e-3)
+    degrees = allan.equivalent_degrees_of_freedom(alpha, 200, m)
+    assert_allclose(degrees, by_definition(alpha, 200, m), rtol=2e-3)
 
 
 BANDS = {
@@ -424,15 +424,15 @@ def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen(records):
         sum(c**2 * allan.spectrum.expected_power(t, samples, 1.0, j) for t, c in zip(terms, (N, B), strict=True))
     )
     generator = np.random.default_rng(12)
-    inside, above, seen = [], [], []
+    inside, above, supported = [], [], []
     for _ in range(records):
         drawn = np.concatenate([[0.0], sigma * generator.standard_normal(samples - 1)])
         fit = allan.fit_noise(idct(drawn, norm="ortho"), 1.0, terms=terms)
         truth = np.array([N, B])
         inside.append((fit.lower[0] <= truth) & (truth <= fit.upper[0]))
         above.append(fit.upper[0, 1] < B)
-        seen.append(fit.supported[0, 1])
-    assert 0.3 < np.mean(seen) < 0.9
+        supported.append(fit.supported[0, 1])
+    assert 0.3 < np.mean(supported) < 0.9
     assert np.all(np.abs(np.mean(inside, axis=0) - 0.955) < 0.04)
     assert 0.005 < np.mean(above) < 0.05  # 0.025; one-sided bounds give 0.065 here
 
@@ -520,18 +520,18 @@ def test_intervals_average_over_the_terms_that_may_be_there():
         return 0.5 * np.sum(number * np.log(q * basis + n) + power[:, axis] / (q * basis + n))
 
     def least(n, axis, highest=0.3):  # over q ≥ 0
-        found = minimize_scalar(
+        minimum = minimize_scalar(
             lambda q: loss(q, n, axis), bounds=(0.0, highest), method="bounded", options={"xatol": 1e-10}
         )
-        return min(found.fun, loss(0.0, n, axis))
+        return min(minimum.fun, loss(0.0, n, axis))
 
     def best(function):
-        found = minimize_scalar(function, bounds=(0.5, 1.5), method="bounded", options={"xatol": 1e-10})
-        return found.x, found.fun
+        minimum = minimize_scalar(function, bounds=(0.5, 1.5), method="bounded", options={"xatol": 1e-10})
+        return minimum.x, minimum.fun
 
     alone = [best(lambda n, axis=axis: loss(0.0, n, axis)) for axis in range(2)]
     both = [best(lambda n, axis=axis: least(n, axis)) for axis in range(2)]
-    gain = sum(one[1] - two[1] for one, two in zip(alone, both, strict=True))
+    gain = sum(single[1] - two[1] for single, two in zip(alone, both, strict=True))
     weight = 1.0 / (1.0 + math.exp(gain - 2.0 * allan.noise_fit.TERM_COST))  # of white noise alone
     assert 0.1 < weight < 0.9
     for axis in range(2):
@@ -653,10 +653,10 @@ def test_expected_errors_by_the_full_information():
     information = np.array([[0.5 * np.trace(inverse @ a @ inverse @ b) for b in parts] for a in parts])
     sizes = np.array(list(truth.values()))
     errors = np.sqrt(np.diag(np.linalg.inv(information))) * 0.5 / sizes
-    found = allan.expected_errors(truth, samples, dt)
-    assert list(found) == list(truth)
+    predicted = allan.expected_errors(truth, samples, dt)
+    assert list(predicted) == list(truth)
     # Flicker's and quantisation's coefficients are taken for independent; pooled in bins of 5 %.
-    assert_allclose(list(found.values()), errors, rtol=0.05)
+    assert_allclose(list(predicted.values()), errors, rtol=0.05)
     slope = difference @ np.arange(samples)
     with_ramp = allan.expected_errors({**truth, "rate_ramp": 0.1}, samples, dt)
     assert_allclose(with_ramp["rate_ramp"], 1.0 / math.sqrt(slope @ inverse @ slope), rtol=0.05)
@@ -669,22 +669,22 @@ def test_expected_errors_by_the_full_information():
 @pytest.mark.parametrize("factor", [1e-12, 1e6])
 def test_units_scale_through(factor):
     rate = simulate(5, 4096, 1.0, **corners(4096, 100.0, 20.0), R=0.01)
-    one, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate * factor + 3.0 * factor, 1.0)
-    assert np.array_equal(one.supported, other.supported)
-    assert_allclose(other.estimate, factor * one.estimate, rtol=1e-4)
-    assert_allclose(other.upper, factor * one.upper, rtol=1e-4)
+    fit, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate * factor + 3.0 * factor, 1.0)
+    assert np.array_equal(fit.supported, other.supported)
+    assert_allclose(other.estimate, factor * fit.estimate, rtol=1e-4)
+    assert_allclose(other.upper, factor * fit.upper, rtol=1e-4)
     stretched = allan.fit_noise(rate, 4.0)
     powers = np.array([1.0, 0.5, 0.0, -0.5, -1.0])
-    assert_allclose(stretched.upper, one.upper * 4.0**powers, rtol=1e-4)
+    assert_allclose(stretched.upper, fit.upper * 4.0**powers, rtol=1e-4)
 
 
 def test_a_ramp_moves_the_ramp_alone():
     rate = simulate(6, 4096, 1.0, **corners(4096, 100.0, 20.0))
-    one, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate - 100.0 * np.arange(4096), 1.0)
-    assert_allclose(other.estimate[0, :4], one.estimate[0, :4], rtol=1e-5)
+    fit, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate - 100.0 * np.arange(4096), 1.0)
+    assert_allclose(other.estimate[0, :4], fit.estimate[0, :4], rtol=1e-5)
     assert_allclose(other.estimate[0, 4], -100.0, rtol=1e-3)
-    assert other.lower[0, 4] < -100.0 + one.upper[0, 4]
-    assert other.upper[0, 4] > -100.0 - one.upper[0, 4]
+    assert other.lower[0, 4] < -100.0 + fit.upper[0, 4]
+    assert other.upper[0, 4] > -100.0 - fit.upper[0, 4]
 
 
 def test_chosen_terms_only():

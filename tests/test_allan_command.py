@@ -77,11 +77,11 @@ def test_a_simulated_accelerometer_at_rest_gives_the_file_of_kalibr(succeeds, re
     both = ("--sensor", "gyro", "--sensor", "accelerometer", "--kalibr")
     succeeds("allan", "rest.h5", *both)
     lines = (tmp_path / "allan-results" / "imu.yaml").read_text(encoding="utf-8").splitlines()
-    found = {
+    values = {
         name: float(rest.split()[0]) for name, _, rest in (line.partition(": ") for line in lines) if rest[:1].isdigit()
     }
-    assert found["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.02)
-    assert found["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.02)
+    assert values["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.02)
+    assert values["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.02)
     (tmp_path / "unit.toml").write_text(ACCELEROMETER.replace('kind = "vector"\n', ""), encoding="utf-8")
     succeeds("simulate", "unit.toml")
     assert 'simulate it with kind = "vector"' in refusal("allan", "unit.h5", *both, "--out", "other")
@@ -155,8 +155,8 @@ def test_npy_csv_and_units_agree(succeeds, tmp_path):
     np.savetxt(tmp_path / "gyro.csv", columns, delimiter=",", header=header, comments="", fmt="%.17g")
     succeeds("allan", "gyro.npy", *AT_100_HZ, "--out", "a")
     succeeds("allan", "gyro.csv", "--out", "b")
-    one, other = written(tmp_path, "a")[0], written(tmp_path, "b")[0]
-    np.testing.assert_allclose(one.angle_random_walk, other.angle_random_walk, rtol=3e-6)
+    from_npy, from_csv = written(tmp_path, "a")[0], written(tmp_path, "b")[0]
+    np.testing.assert_allclose(from_npy.angle_random_walk, from_csv.angle_random_walk, rtol=3e-6)
 
 
 def test_a_name_with_a_line_break_still_gives_toml(succeeds, tmp_path):
@@ -220,15 +220,15 @@ def test_the_round_trip_of_each_term(term):
     edges = DT * np.arange(samples + 1)
     increments = gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(3, 0, "gyro")).increments
     fit = allan.fit_noise(increments, DT, kind="increments")
-    found = gyro.GyroSpec(**allan.to_gyro_parameters(fit))
+    estimate = gyro.GyroSpec(**allan.to_gyro_parameters(fit))
     truth = {name: float(getattr(spec, name)) for name in allan.TERMS}
     expected = allan.expected_errors(truth, samples, DT)
     for name in allan.TERMS:
         if truth[name] != 0.0:
-            error = (np.asarray(getattr(found, name)) - truth[name]) / expected[name]
+            error = (np.asarray(getattr(estimate, name)) - truth[name]) / expected[name]
             # The χ² of three at 1e-4 on either side; found afresh on each axis, so not the same on all.
             assert 0.003 < error @ error < 21.1, name
         else:
-            assert np.all(np.asarray(getattr(found, name)) == 0.0), name
+            assert np.all(np.asarray(getattr(estimate, name)) == 0.0), name
     assert expected[term] < 0.12 * abs(truth[term])
-    assert gyro.from_table(gyro.to_table(found)) == found
+    assert gyro.from_table(gyro.to_table(estimate)) == estimate

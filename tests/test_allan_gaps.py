@@ -36,9 +36,9 @@ def true_variance(kind: str, m: np.ndarray) -> np.ndarray:
 def test_a_sum_by_hand():
     """σ²(1): half the mean square of neighbouring differences."""
     values = np.array([1.0, 3.0, np.nan, 4.0, 8.0, 9.0])
-    found = allan.allan_deviation(values, 0.5, taus=[0.5])
-    assert abs(found.deviation[0, 0] - np.sqrt(0.5 * np.mean([4.0, 16.0, 1.0]))) < 1e-12
-    assert found.samples == 5
+    result = allan.allan_deviation(values, 0.5, taus=[0.5])
+    assert abs(result.deviation[0, 0] - np.sqrt(0.5 * np.mean([4.0, 16.0, 1.0]))) < 1e-12
+    assert result.samples == 5
 
 
 @pytest.mark.parametrize(
@@ -61,17 +61,21 @@ def over_records(kind: str, known: np.ndarray, m: np.ndarray) -> tuple[np.ndarra
     """Return the mean Allan variance over 300 records, its standard error, and its expected value."""
     records = noise(kind, (300, len(known)), 7)
     records[:, ~known] = np.nan
-    found = np.array([allan.allan_deviation(one, 1.0, taus=m).deviation[0] ** 2 for one in records])
-    return np.nanmean(found, axis=0), np.nanstd(found, axis=0) / np.sqrt(300), true_variance(kind, m.astype(float))
+    variances = np.array([allan.allan_deviation(record, 1.0, taus=m).deviation[0] ** 2 for record in records])
+    return (
+        np.nanmean(variances, axis=0),
+        np.nanstd(variances, axis=0) / np.sqrt(300),
+        true_variance(kind, m.astype(float)),
+    )
 
 
 def test_a_sample_lost_leaves_the_overlapping_estimator():
     x = noise("walk", (1, 3000), 2)[0]
     whole = allan.allan_deviation(x, 1.0, taus=[1.0, 7.0, 16.0, 300.0])
     x[-1] = np.nan
-    found = allan.allan_deviation(x, 1.0, taus=whole.taus)
-    np.testing.assert_allclose(found.deviation, whole.deviation, rtol=2e-2)
-    np.testing.assert_allclose(found.edf, whole.edf, rtol=2e-2)
+    with_gap = allan.allan_deviation(x, 1.0, taus=whole.taus)
+    np.testing.assert_allclose(with_gap.deviation, whole.deviation, rtol=2e-2)
+    np.testing.assert_allclose(with_gap.edf, whole.edf, rtol=2e-2)
 
 
 @pytest.mark.parametrize(("kind", "lost"), [("white", "long"), ("walk", "single")])
@@ -90,16 +94,16 @@ def test_a_gap_of_a_tenth(K):
     walk = np.cumsum(K * random.standard_normal((samples + 1, runs)), axis=0)
     x = 0.5 * (walk[1:] + walk[:-1]) + np.sqrt(1.0 + K**2 / 12.0) * random.standard_normal((samples, runs))
     x[2000:2500] = np.nan
-    records = [allan.allan_deviation(one, 1.0, taus=[1.0, 30.0, 100.0, 250.0, 500.0]) for one in x.T]
+    records = [allan.allan_deviation(samples, 1.0, taus=[1.0, 30.0, 100.0, 250.0, 500.0]) for samples in x.T]
     taus, lower, upper = (
         records[0].taus,
-        *(np.array([getattr(one, end)[0] for one in records]) for end in ("lower", "upper")),
+        *(np.array([getattr(record, end)[0] for record in records]) for end in ("lower", "upper")),
     )
     truth = 1.0 / taus + K**2 * taus / 3.0
     share = np.mean((lower**2 <= truth) & (truth <= upper**2), axis=0)
     assert np.abs(np.mean(share) - 0.95) < 0.02, share
     assert (np.abs(share - 0.95) < 0.05).all(), share  # four σ
-    white = np.array([one.noise_type[0] == "angle random walk" for one in records])
+    white = np.array([record.noise_type[0] == "angle random walk" for record in records])
     assert K or np.mean(white) > 0.95
 
 
@@ -108,8 +112,8 @@ def covers(kind: str, known: np.ndarray, m: np.ndarray) -> None:
     truth = true_variance(kind, m.astype(float))
     records = noise(kind, (runs, samples), 11)
     records[:, ~known] = np.nan
-    found = [allan.allan_deviation(one, 1.0, taus=m) for one in records]
-    lower, upper = (np.array([getattr(one, end)[0] for one in found]) for end in ("lower", "upper"))
+    estimates = [allan.allan_deviation(record, 1.0, taus=m) for record in records]
+    lower, upper = (np.array([getattr(estimate, end)[0] for estimate in estimates]) for end in ("lower", "upper"))
     share = np.mean((lower**2 <= truth) & (truth <= upper**2), axis=0)
     assert (share > 0.89).all(), share
     assert (share < 0.995).all(), share
@@ -155,7 +159,7 @@ def test_a_stretch_that_moves_is_seen():
     y = noise("white", (1, 4000), 3)[0]
     y[1000] = 5.5
     once, twice = (
-        allan.fit_noise(one, 0.01, terms=allan.TERMS[1:2]).misfit_probability[0] for one in (y, [*y, np.nan, *y])
+        allan.fit_noise(record, 0.01, terms=allan.TERMS[1:2]).misfit_probability[0] for record in (y, [*y, np.nan, *y])
     )
     assert 1e-6 < once < 0.1
     assert twice == pytest.approx(2.0 * once, rel=1e-6)

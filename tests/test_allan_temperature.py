@@ -27,12 +27,12 @@ def test_what_is_put_in_comes_out():
     t = T - T.mean()
     quiet = 1e-9 * np.random.default_rng(1).standard_normal((4000, 2))
     x = np.stack([0.3 + 2e-3 * t - 4e-5 * t**2, -1.0 - 1e-3 * t], axis=1) + quiet
-    found = allan_temperature.fit_temperature(x, T, DT, order=2)
-    polynomial = found.polynomial
+    fit = allan_temperature.fit_temperature(x, T, DT, order=2)
+    polynomial = fit.polynomial
     np.testing.assert_allclose(polynomial.coefficients.T, [[0.3, 2e-3, -4e-5], [-1.0, -1e-3, 0.0]], atol=1e-9)
     np.testing.assert_allclose(polynomial.bias([T[0], T[-1]]), (x - quiet)[[0, -1]], atol=1e-8)
     assert polynomial.span == (T.min(), T.max())
-    np.testing.assert_allclose(found.left, np.broadcast_to(x.mean(axis=0), x.shape), atol=1e-7)
+    np.testing.assert_allclose(fit.left, np.broadcast_to(x.mean(axis=0), x.shape), atol=1e-7)
 
 
 def test_its_intervals_cover_where_plain_least_squares_would_not():
@@ -40,16 +40,16 @@ def test_its_intervals_cover_where_plain_least_squares_would_not():
     samples, runs = 3000, 20
     T = warm_up(samples)
     x = 1e-3 * (T - T.mean())[:, None] + records(samples, runs, 5)
-    found = allan_temperature.fit_temperature(x, T, DT, order=1)
-    inside = np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]
+    fit = allan_temperature.fit_temperature(x, T, DT, order=1)
+    inside = np.abs(fit.polynomial.coefficients[1] - 1e-3) <= fit.reach[1]
     assert 16 <= inside.sum() <= 20
-    assert 0.6 < np.std(found.polynomial.coefficients[1]) / found.polynomial.sigma[1].mean() < 1.4  # of 20: ±16 %
+    assert 0.6 < np.std(fit.polynomial.coefficients[1]) / fit.polynomial.sigma[1].mean() < 1.4  # of 20: ±16 %
     A = np.stack([np.ones(samples), T - T.mean()], axis=1)
     plain, rest, *_ = np.linalg.lstsq(A, x, rcond=None)
     sigma = np.sqrt(rest / (samples - 2) / np.sum((T - T.mean()) ** 2))
     assert np.sum(np.abs(plain[1] - 1e-3) < 1.96 * sigma) < runs / 2
     # and it is nearer, for it knows where the noise is
-    assert np.std(found.polynomial.coefficients[1]) < np.std(plain[1])
+    assert np.std(fit.polynomial.coefficients[1]) < np.std(plain[1])
 
 
 def three_hours(shape: str, K: float, runs: int):

@@ -133,12 +133,12 @@ def test_no_circle_of_modules():
     graphlib.TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize(("one", "other"), STRANGERS)
-def test_strangers_never_meet(one, other):
+@pytest.mark.parametrize(("stranger", "other"), STRANGERS)
+def test_strangers_never_meet(stranger, other):
     for module, tree in sources().items():
-        seen = {unit(found) for name in imports(tree) if (found := internal(name))}
-        if unit(module) in (one, other):
-            assert not seen & ({one, other} - {unit(module)}), f"{module} imports its stranger"
+        units = {unit(target) for name in imports(tree) if (target := internal(name))}
+        if unit(module) in (stranger, other):
+            assert not units & ({stranger, other} - {unit(module)}), f"{module} imports its stranger"
 
 
 PARSERS = ("np.load", "np.loadtxt", "np.genfromtxt", "np.fromfile", "tomllib.load", "tomllib.loads")

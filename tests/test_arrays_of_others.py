@@ -25,9 +25,9 @@ def estimate(**change):
 
 
 def checked(**change):
-    given = {**GIVEN, "true_time": TIME, "true_attitude": TRUE, "true_bias": BIAS} | change
-    truth = {name: given.pop(f"true_{name}") for name in ("time", "attitude", "bias")}
-    both = (recordings.Attitudes.from_arrays(**one) for one in (given, truth))
+    estimate = {**GIVEN, "true_time": TIME, "true_attitude": TRUE, "true_bias": BIAS} | change
+    truth = {name: estimate.pop(f"true_{name}") for name in ("time", "attitude", "bias")}
+    both = (recordings.Attitudes.from_arrays(**columns) for columns in (estimate, truth))
     return consistency.check_attitudes(*both)
 
 
@@ -51,7 +51,7 @@ def masked(value):
     return hidden
 
 
-@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda one: getattr(one, "__name__", one))
+@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda value: getattr(value, "__name__", value))
 def test_complex_arrays_are_refused_by_name(call, name):
     with pytest.raises(
         InputError,
@@ -70,7 +70,7 @@ MISSING = {
 """Arrays with NaN at times without an estimate, or without a bias."""
 
 
-@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda one: getattr(one, "__name__", one))
+@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda value: getattr(value, "__name__", value))
 def test_masked_values_are_missing_or_refused_by_name(call, name):
     value = masked(VALUES[name])
     with_nan = np.array(VALUES[name])
@@ -111,10 +111,10 @@ def test_masked_columns_are_missing_samples(read):
     for name in ("gyro [rad/s]", "acc [m/s2]", "temperature"):
         columns[name] = masked(columns[name])
         nan[name][3] = np.nan
-    found, expected = read(columns), read(nan)
+    recording, expected = read(columns), read(nan)
     for name in ("time", "rate", "specific_force", "temperature", "missing_gyro"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    assert len(found.missing_gyro) == 1
+        np.testing.assert_array_equal(getattr(recording, name), getattr(expected, name))
+    assert len(recording.missing_gyro) == 1
     assert len(read(table() | {"time": np.ma.array(TIME)}).time) == N  # nothing masked
 
 
@@ -155,11 +155,11 @@ def test_an_asymmetric_covariance_is_refused_with_its_place(i, j):
 
 def flat():
     columns = table()
-    found = {"time": columns["time"]}
+    by_axis = {"time": columns["time"]}
     for name, prefix in (("gyro [rad/s]", "g"), ("acc [m/s2]", "a")):
         unit = name.partition(" ")[2]
-        found |= {f"{prefix}{axis} {unit}": columns[name][:, k] for k, axis in enumerate("xyz")}
-    return columns, found
+        by_axis |= {f"{prefix}{axis} {unit}": columns[name][:, k] for k, axis in enumerate("xyz")}
+    return columns, by_axis
 
 
 class Stream:
@@ -175,11 +175,11 @@ class Stream:
 @pytest.mark.parametrize("frame", ["table", "stream", "batch"])
 def test_arrow_tables_and_frames_of_its_kind_are_read(frame):
     arrow = pytest.importorskip("pyarrow")
-    columns, found = flat()
-    held = arrow.table({name: arrow.array(value) for name, value in found.items()})
-    given = {"table": held, "stream": Stream(held), "batch": held.to_batches()[0]}[frame]
-    np.testing.assert_array_equal(sd.read(given).rate, columns["gyro [rad/s]"])
-    nulls = held.set_column(1, "gx [rad/s]", arrow.array([None, *found["gx [rad/s]"][1:]]))
+    columns, by_axis = flat()
+    held = arrow.table({name: arrow.array(value) for name, value in by_axis.items()})
+    source = {"table": held, "stream": Stream(held), "batch": held.to_batches()[0]}[frame]
+    np.testing.assert_array_equal(sd.read(source).rate, columns["gyro [rad/s]"])
+    nulls = held.set_column(1, "gx [rad/s]", arrow.array([None, *by_axis["gx [rad/s]"][1:]]))
     assert sd.read(nulls).missing_gyro.tolist() == [0.0]
     unit = arrow.field("temperature", arrow.float64(), metadata={b"unit": b"degC"})
     with_unit = held.append_column(unit, arrow.array(columns["temperature"]))
@@ -192,9 +192,9 @@ def test_structured_arrays_are_read():
     held = np.zeros(N, kinds)
     for name, value in columns.items():
         held[name] = value
-    for given in (held, held.view(np.recarray)):
-        found = sd.read(given)
-        np.testing.assert_array_equal(found.rate, columns["gyro [rad/s]"])
-        np.testing.assert_array_equal(found.specific_force, columns["acc [m/s2]"])
+    for array in (held, held.view(np.recarray)):
+        recording = sd.read(array)
+        np.testing.assert_array_equal(recording.rate, columns["gyro [rad/s]"])
+        np.testing.assert_array_equal(recording.specific_force, columns["acc [m/s2]"])
     with pytest.raises(InputError, match="table is an array without names of columns"):
         sd.read(np.zeros((N, 4)))

@@ -30,29 +30,29 @@ def turned():
 
 def spoiled(run: int) -> Recording:
     """A simulated hand whose gyro has the same matrix in each recording."""
-    one = hand_held.simulated(3, run, 40.0)
-    return dataclasses.replace(one, rate=one.rate @ (np.eye(3) + MATRIX).T)
+    recording = hand_held.simulated(3, run, 40.0)
+    return dataclasses.replace(recording, rate=recording.rate @ (np.eye(3) + MATRIX).T)
 
 
 # ------------------------------------------------------------------------------------------------------------------ the estimate
 
 
-def normalised(unit, found):
+def normalised(unit, estimate):
     """Errors of a calibration over their σ."""
-    pairs = zip(unit.entries(), found.entries(), found.sigma.entries(), strict=True)
+    pairs = zip(unit.entries(), estimate.entries(), estimate.sigma.entries(), strict=True)
     return np.array([(b - a) / s for (_, _, a), (_, _, b), (_, _, s) in pairs])
 
 
 def test_every_error_is_found_within_its_sigma(turned):
-    unit, _, found = turned
-    z = normalised(unit, found)
+    unit, _, estimate = turned
+    z = normalised(unit, estimate)
     assert np.abs(z).max() < 4.0
     assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
     # and the σ are small: thousandths of the matrices, hundredths of m/s², of the field and of ms
-    assert found.sigma.gyro_matrix.max() < 4e-3
-    assert found.sigma.accelerometer_bias.max() < 0.03
-    assert found.sigma.hard_iron.max() < 0.02 * np.linalg.norm(study.FIELD_F)
-    assert found.sigma.magnetometer_delay < 1e-3
+    assert estimate.sigma.gyro_matrix.max() < 4e-3
+    assert estimate.sigma.accelerometer_bias.max() < 0.03
+    assert estimate.sigma.hard_iron.max() < 0.02 * np.linalg.norm(study.FIELD_F)
+    assert estimate.sigma.magnetometer_delay < 1e-3
 
 
 @pytest.mark.slow
@@ -65,12 +65,12 @@ def test_95_of_100_intervals_contain_the_truth():
 
 def test_a_unit_without_magnetometer_is_calibrated_too(turned):
     unit, recording, _ = turned
-    found = sd.calibrate(dataclasses.replace(recording, magnetic_field=None, magnetic_unit=""))
-    assert not found.sigma.magnetometer_matrix.any()
+    estimate = sd.calibrate(dataclasses.replace(recording, magnetic_field=None, magnetic_unit=""))
+    assert not estimate.sigma.magnetometer_matrix.any()
     for name in ("gyro_bias", "gyro_matrix", "accelerometer_bias", "accelerometer_matrix"):
-        error = np.abs(getattr(found, name) - getattr(unit, name))
-        assert np.all(error < 4.0 * getattr(found.sigma, name)), name
-    assert found.sigma.accelerometer_bias.max() < 0.05
+        error = np.abs(getattr(estimate, name) - getattr(unit, name))
+        assert np.all(error < 4.0 * getattr(estimate.sigma, name)), name
+    assert estimate.sigma.accelerometer_bias.max() < 0.05
 
 
 @pytest.mark.slow
@@ -105,15 +105,15 @@ def test_missing_motion_is_said():
         time=np.arange(6 * still.sum()) / study.RATE,
         movement=None,
     )
-    found = sd.calibrate(rest)
-    text = " ".join(found.remarks)
+    estimate = sd.calibrate(rest)
+    text = " ".join(estimate.remarks)
     for words in ("Turn about x", "Turn about y", "Turn about z", "Rest with", "into all attitudes"):
         assert words in text
     # at rest nothing is learnt of the gyro's matrix: σ is that of the prior
-    assert np.all(found.sigma.gyro_matrix > 0.9 * 0.02)
-    assert found.sigma.gyro_bias.max() < np.radians(0.05)
-    assert "gyro scale x" in str(found)
-    assert "Rest with" in str(found)
+    assert np.all(estimate.sigma.gyro_matrix > 0.9 * 0.02)
+    assert estimate.sigma.gyro_bias.max() < np.radians(0.05)
+    assert "gyro scale x" in str(estimate)
+    assert "Rest with" in str(estimate)
 
 
 def test_the_prediction_has_the_derivatives_of_its_differences(turned):
@@ -150,11 +150,11 @@ def test_the_prediction_has_the_derivatives_of_its_differences(turned):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda one: [], "at least one recording"),
-        (lambda one: [one.time], "recordings"),
-        (lambda one: dataclasses.replace(one, specific_force=None), "no accelerometer"),
-        (lambda one: [one, dataclasses.replace(one, magnetic_unit="mG")], "one unit for all"),
-        (lambda one: hand_held.simulated(1, 0, 3.0), "needs at least 10 s"),
+        (lambda recording: [], "at least one recording"),
+        (lambda recording: [recording.time], "recordings"),
+        (lambda recording: dataclasses.replace(recording, specific_force=None), "no accelerometer"),
+        (lambda recording: [recording, dataclasses.replace(recording, magnetic_unit="mG")], "one unit for all"),
+        (lambda recording: hand_held.simulated(1, 0, 3.0), "needs at least 10 s"),
     ],
 )
 def test_recordings_that_cannot_be_calibrated_are_refused(turned, change, words):
@@ -179,9 +179,9 @@ def test_samples_are_corrected(turned):
 
 
 def test_an_estimate_with_the_calibration_is_better(turned):
-    unit, _, found = turned
+    unit, _, estimate = turned
     second = study.simulated(unit, 3, 2, 30.0, pauses=False)
-    error = study.attitude_error(second, found)
+    error = study.attitude_error(second, estimate)
     assert error < np.radians(0.5)
     assert error < 0.1 * study.attitude_error(second, None)
 
@@ -197,9 +197,9 @@ def test_what_one_estimate_shows_serves_the_next():
         first, sigma=SensorErrors(gyro_matrix=np.full((3, 3), max(first.gyro_scale_sigma, 3e-3)))
     )
     errors = []
-    for one in (None, known):
-        found = ahrs.estimate(spoiled(2), latency=0.0, calibration=one)
-        errors.append(reference_errors(found.estimate.attitude, found.recording.true_attitude).rms()["inclination"])
+    for unit in (None, known):
+        result = ahrs.estimate(spoiled(2), latency=0.0, calibration=unit)
+        errors.append(reference_errors(result.estimate.attitude, result.recording.true_attitude).rms()["inclination"])
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -222,13 +222,13 @@ def test_corrections_of_the_gyro_follow_one_another(turned):
 
 
 def test_a_file_gives_it_back(turned, tmp_path):
-    found = turned[2]
+    unit = turned[2]
     path = tmp_path / "calibration.toml"
-    calibration.write(found, path)
+    calibration.write(unit, path)
     again = calibration.read(path)
-    assert list(again.entries()) == list(found.entries())
-    assert list(again.sigma.entries()) == list(found.sigma.entries())
-    assert (again.source, again.magnetic_unit) == (found.source, "uT")
+    assert list(again.entries()) == list(unit.entries())
+    assert list(again.sigma.entries()) == list(unit.sigma.entries())
+    assert (again.source, again.magnetic_unit) == (unit.source, "uT")
 
 
 @pytest.mark.parametrize(
@@ -253,8 +253,8 @@ def test_a_wrong_file_is_refused(tmp_path, text, words):
 
 def test_a_known_delay_of_the_magnetometer_is_used_from_the_start():
     known = UnitCalibration(magnetometer_delay=0.011)
-    found = ahrs.estimate(hand_held.simulated(1, 0, 4.0), calibration=known)
-    np.testing.assert_array_equal(found.delays.field, np.full(len(found.recording.time), 0.011))
+    result = ahrs.estimate(hand_held.simulated(1, 0, 4.0), calibration=known)
+    np.testing.assert_array_equal(result.delays.field, np.full(len(result.recording.time), 0.011))
 
 
 # -------------------------------------------------------------------------------------------------------------- recorded units
@@ -268,10 +268,12 @@ def test_recorded_units_err_less_in_fast_motion_when_calibrated_in_slow():
         pytest.skip(f"needs the recordings of the Sassari set in {SETS}")
     errors = []
     for unit in ("AP1", "SH1", "XS1"):
-        found = sd.calibrate(sd.read(SETS / f"slow_v4_{unit}.hdf5"))
+        estimate = sd.calibrate(sd.read(SETS / f"slow_v4_{unit}.hdf5"))
         fast = sd.read(SETS / f"fast_v4_{unit}.hdf5")
-        for one in (fast, found.applied(fast)):
-            samples = (np.ascontiguousarray(x) for x in (one.rate, one.specific_force, one.magnetic_field))
+        for recording in (fast, estimate.applied(fast)):
+            samples = (
+                np.ascontiguousarray(x) for x in (recording.rate, recording.specific_force, recording.magnetic_field)
+            )
             q = vqf.VQF(0.01).updateBatch(*samples)["quat9D"]
             errors.append(rms_without_heading_offset(q, fast))
     before, after = np.mean(np.reshape(errors, (3, 2)), axis=0)

@@ -106,10 +106,13 @@ def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
     recording = simulated(seed, reference=reference)
     assert check_conventions.examine(recording).verdict == "as declared"
     for name, (wrong, words) in broken(recording, seed).items():
-        found = check_conventions.examine(wrong)
-        assert found.verdict == "wrong convention", name
+        examination = check_conventions.examine(wrong)
+        assert examination.verdict == "wrong convention", name
         # Without a reference a sensor inverted as a whole fits as well, and is reported beside.
-        assert words in " ".join([found.reason, *(() if reference else found.notes)]), (name, found.reason)
+        assert words in " ".join([examination.reason, *(() if reference else examination.notes)]), (
+            name,
+            examination.reason,
+        )
 
 
 def test_the_axes_of_a_unit_that_is_swung_until_it_clips_are_not_doubted():
@@ -128,8 +131,8 @@ def test_one_mistake_in_a_broad_trial_is_named(broad):
         recording = recordings.read(path)
         assert check_conventions.examine(recording).verdict == "as declared", path.name
         for name, (wrong, words) in broken(recording, k).items():
-            found = check_conventions.examine(wrong)
-            assert words in found.reason, (path.name, name, found.reason)
+            examination = check_conventions.examine(wrong)
+            assert words in examination.reason, (path.name, name, examination.reason)
 
 
 @pytest.mark.slow
@@ -140,43 +143,49 @@ def test_one_mistake_in_all_broad_trials_with_reference_and_without(broad):
             plain = check_conventions.examine(recording)
             assert plain.verdict == "as declared" or (recording is not whole and plain.verdict == "cannot tell")
             for name, (wrong, words) in broken(recording, k).items():
-                found = check_conventions.examine(wrong)
-                if recording is not whole and found.verdict == "cannot tell":
+                examination = check_conventions.examine(wrong)
+                if recording is not whole and examination.verdict == "cannot tell":
                     continue  # the unit is hardly turned there
-                assert words in " ".join([found.reason, *found.notes]), (path.name, name, found.reason)
+                assert words in " ".join([examination.reason, *examination.notes]), (
+                    path.name,
+                    name,
+                    examination.reason,
+                )
 
 
 def test_two_mistakes_are_named_together():
     recording = simulated(4)
     wrong = replace(recording, true_attitude=conjugated(recording.true_attitude), rate=recording.rate * 180.0 / np.pi)
-    found = check_conventions.examine(wrong)
-    assert "conjugated" in found.reason
-    assert "57.3 times too large" in found.reason
+    examination = check_conventions.examine(wrong)
+    assert "conjugated" in examination.reason
+    assert "57.3 times too large" in examination.reason
 
 
 def test_the_gyro_and_the_accelerometer_alone():
     recording = replace(simulated(5, reference=False), magnetic_field=None)
     assert check_conventions.examine(recording).verdict == "as declared"
-    found = check_conventions.examine(replace(recording, rate=-recording.rate))
-    assert found.reason.startswith("axes of the gyro are inverted")
+    examination = check_conventions.examine(replace(recording, rate=-recording.rate))
+    assert examination.reason.startswith("axes of the gyro are inverted")
     swapped = replace(recording, rate=recording.rate[:, [1, 0, 2]])
-    found = check_conventions.examine(swapped)
-    assert found.verdict == "wrong convention"
-    assert "should be read as (y, x, z)" in " ".join([found.reason, *found.notes])
-    assert any("which of the two" in note for note in found.notes)
+    examination = check_conventions.examine(swapped)
+    assert examination.verdict == "wrong convention"
+    assert "should be read as (y, x, z)" in " ".join([examination.reason, *examination.notes])
+    assert any("which of the two" in note for note in examination.notes)
 
 
 def test_a_recording_that_does_not_turn_cannot_tell():
     for reference in (True, False):
         recording = simulated(6, amplitude=1e-4, reference=reference)
-        found = check_conventions.examine(recording)
-        assert found.verdict == "cannot tell"
-        assert found.doubts == ()
+        examination = check_conventions.examine(recording)
+        assert examination.verdict == "cannot tell"
+        assert examination.doubts == ()
         # gravity shows the unit of the accelerometer all the same
         for factor, words in ((STANDARD_GRAVITY, "9.81 times too large"), (1.0 / STANDARD_GRAVITY, "too small")):
-            found = check_conventions.examine(replace(recording, specific_force=factor * recording.specific_force))
-            assert found.verdict == "cannot tell"
-            assert any(words in doubt for doubt in found.doubts)
+            examination = check_conventions.examine(
+                replace(recording, specific_force=factor * recording.specific_force)
+            )
+            assert examination.verdict == "cannot tell"
+            assert any(words in doubt for doubt in examination.doubts)
 
 
 def test_the_fastest_windows_decide_after_a_long_rest():
@@ -187,7 +196,7 @@ def test_the_fastest_windows_decide_after_a_long_rest():
         assert samples is not None
         return np.concatenate([np.tile(samples[0], (rest, 1)), samples])
 
-    found = check_conventions.examine(
+    examination = check_conventions.examine(
         Recording(
             source="rest, then motion",
             time=np.arange(rest + len(moving.time)) / 100.0,
@@ -196,17 +205,17 @@ def test_the_fastest_windows_decide_after_a_long_rest():
             magnetic_field=after_rest(moving.magnetic_field),
         )
     )
-    assert found.verdict == "wrong convention"
-    assert "axes of the accelerometer" in found.reason
+    assert examination.verdict == "wrong convention"
+    assert "axes of the accelerometer" in examination.reason
 
 
 def test_noise_is_no_convention():
     recording = simulated(7)
     random = np.random.default_rng(0)
     other = quaternion.normalize(random.standard_normal(recording.true_attitude.shape))
-    found = check_conventions.examine(replace(recording, true_attitude=other))
-    assert found.verdict == "cannot tell"
-    assert "no explanation tried fits" in found.reason
+    examination = check_conventions.examine(replace(recording, true_attitude=other))
+    assert examination.verdict == "cannot tell"
+    assert "no explanation tried fits" in examination.reason
 
 
 def test_missing_rows_are_left_out():
@@ -227,8 +236,8 @@ def test_a_gyro_alone_is_refused():
 
 def test_a_force_in_no_unit_is_noted():
     recording = simulated(9)
-    found = check_conventions.examine(replace(recording, specific_force=recording.specific_force / 3.0))
-    assert any("fits neither" in doubt for doubt in found.doubts)
+    examination = check_conventions.examine(replace(recording, specific_force=recording.specific_force / 3.0))
+    assert any("fits neither" in doubt for doubt in examination.doubts)
 
 
 def test_rates_beyond_any_gyro_are_doubted():
@@ -288,12 +297,12 @@ def test_python_warns_of_what_the_command_warns_of(run, mistake, words):
     assert len(said) == bool(words)
     walk = sd.read("walk.csv")
     for use in (sd.estimate, sd.smooth, sd.tune):
-        with warnings.catch_warnings(record=True) as found:
+        with warnings.catch_warnings(record=True) as entries:
             warnings.simplefilter("always")
             use(walk)
         advice = "See `strapdown doctor`, with the same file and its options."
-        assert [f"warning: {Hint.replaced(str(one.message), option)}. {advice}" for one in found] == said
-        assert all(one.category is sd.ahrs.ConventionWarning for one in found)
+        assert [f"warning: {Hint.replaced(str(entry.message), option)}. {advice}" for entry in entries] == said
+        assert all(entry.category is sd.ahrs.ConventionWarning for entry in entries)
     assert all(Hint.replaced(words, option) in line for line in said)
 
 
@@ -334,6 +343,6 @@ def test_the_misfit_of_unrelated_directions_is_one():
     """cos of the angle between two random directions is uniform: its variance is a third."""
     u = np.random.default_rng(3).standard_normal((2, 5000, 3))
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    found = check_conventions._fixed_misfits(dict(zip(("accelerometer", "magnetometer"), u, strict=True)))
-    assert found["gyro and magnetometer"] == pytest.approx(0.0, abs=1e-12)
-    assert found["accelerometer and magnetometer"] == pytest.approx(1.0, rel=0.05)
+    misfits = check_conventions._fixed_misfits(dict(zip(("accelerometer", "magnetometer"), u, strict=True)))
+    assert misfits["gyro and magnetometer"] == pytest.approx(0.0, abs=1e-12)
+    assert misfits["accelerometer and magnetometer"] == pytest.approx(1.0, rel=0.05)

@@ -67,15 +67,15 @@ def test_what_lies_under_a_mask_is_no_data(value):
     refused(lambda: checks.array("x", value, ("n", 2)), "x[1, 1] is masked", "remove or interpolate")
     refused(lambda: checks.numbers("x", value), "x[1, 1] is masked")
     if value is MASKED:
-        found = checks.array("x", value, ("n", 2), allow_nan=True)
-        np.testing.assert_array_equal(found, [[1.0, 2.0], [3.0, np.nan], [np.nan, 6.0]])
-        assert type(found) is np.ndarray
+        array = checks.array("x", value, ("n", 2), allow_nan=True)
+        np.testing.assert_array_equal(array, [[1.0, 2.0], [3.0, np.nan], [np.nan, 6.0]])
+        assert type(array) is np.ndarray
 
 
 def test_a_mask_that_masks_nothing_is_no_matter():
-    found = checks.array("x", np.ma.masked_array([1.0, 2.0], mask=False), (2,))
-    assert type(found) is np.ndarray
-    np.testing.assert_array_equal(found, [1.0, 2.0])
+    array = checks.array("x", np.ma.masked_array([1.0, 2.0], mask=False), (2,))
+    assert type(array) is np.ndarray
+    np.testing.assert_array_equal(array, [1.0, 2.0])
 
 
 def test_nan_may_mark_missing_samples_but_infinity_never_passes():

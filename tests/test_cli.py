@@ -157,7 +157,7 @@ def test_coning_json_has_the_keys_that_others_read(coning):
     own = ["rounded", "miller-3"]
     assert [row["algorithm"] for row in study["integration"]] == [*ALGORITHMS, *own]
     assert [row["integration"] for row in study["filter"]] == [*ALGORITHMS, *own]
-    assert [one["name"] for one in study["own"]] == own
+    assert [row["name"] for row in study["own"]] == own
 
 
 def test_coning_studies_algorithms_of_ones_own(coning):
@@ -396,7 +396,7 @@ def test_estimate_on_broad(succeeds, broad, tmp_path):
     }
     errors = json.loads((tmp_path / "out" / "errors.json").read_text())
     assert errors["source"] == path.name
-    rms = {kind: one["rms_deg"] for kind, one in errors["given"]["movement"].items()}
+    rms = {kind: error["rms_deg"] for kind, error in errors["given"]["movement"].items()}
     assert 0.3 < rms["total"] < 6.0
     assert max(rms["heading"], rms["inclination"]) <= rms["total"]
     assert f"{rms['total']:.4g}" in said

@@ -26,23 +26,23 @@ def test_the_command_is_the_function_and_estimate_reads_its_file(succeeds, files
     said = succeeds("calibrate", files / "turned.csv", "--out", out)
     assert "gyro scale x" in said
     assert "good is" in said  # a quarter of a minute is short
-    found = sd.calibrate(sd.read(files / "turned.csv"))
+    unit = sd.calibrate(sd.read(files / "turned.csv"))
     again = calibration.read(out)
-    assert list(again.entries()) == list(found.entries())
-    assert list(again.sigma.entries()) == list(found.sigma.entries())
+    assert list(again.entries()) == list(unit.entries())
+    assert list(again.sigma.entries()) == list(unit.sigma.entries())
     succeeds("estimate", files / "moved.csv", "--calibration", out, "--out", tmp_path / "out", "--motion", "hand")
     by_command = sd.read(tmp_path / "out" / "estimate.h5")
-    by_function = sd.estimate(sd.read(files / "moved.csv"), calibration=found, motion="hand")
+    by_function = sd.estimate(sd.read(files / "moved.csv"), calibration=unit, motion="hand")
     np.testing.assert_array_equal(by_command.attitude, by_function.attitude)
 
 
 @pytest.mark.slow
 def test_gravity_is_told_and_its_own_file_is_replaced(succeeds, files, tmp_path):
     out = tmp_path / "unit.toml"
-    found = sd.calibrate(sd.read(files / "turned.csv"))
-    calibration.write(found, out)
+    unit = sd.calibrate(sd.read(files / "turned.csv"))
+    calibration.write(unit, out)
     succeeds("calibrate", files / "turned.csv", "--out", out, "--gravity", 9.78)
-    assert calibration.read(out).accelerometer_matrix[2, 2] > found.accelerometer_matrix[2, 2]
+    assert calibration.read(out).accelerometer_matrix[2, 2] > unit.accelerometer_matrix[2, 2]
 
 
 def test_what_the_command_did_not_write_is_kept(refusal, files, tmp_path):

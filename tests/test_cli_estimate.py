@@ -46,7 +46,7 @@ HAND = (
 TRACKER = (AttitudeSensor(name="tracker", sigma_across=1e-3, sigma_about=5e-3, rate=5.0),)
 
 
-def made(sensors=STARS, duration=6.0):
+def scenario_of(sensors=STARS, duration=6.0):
     return Scenario(
         motion=motion.Coning(angle=0.3, frequency=0.3), gyro=SPEC, sensors=sensors, rate=50.0, duration=duration
     )
@@ -72,7 +72,7 @@ def specified(record):
 @pytest.fixture
 def record(tmp_path):
     path = tmp_path / "record.h5"
-    write_record(path, specified(simulate(made(), 4)))
+    write_record(path, specified(simulate(scenario_of(), 4)))
     return path
 
 
@@ -87,12 +87,12 @@ def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds,
         "errors.png",
     }
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
-    truth = simulate(made(), 4).truth
+    truth = simulate(scenario_of(), 4).truth
     assert estimate.covariance.shape == (301, 6, 6)
     assert np.max(quaternion.angle_between(estimate.attitude[100:], truth.attitude[100:])) < 5e-3
-    found = json.loads((tmp_path / "out" / "errors.json").read_text())
-    assert 0.3 < found["given"]["all samples"]["total"]["rms_over_sigma"] < 3.0
-    assert 0.0 < found["bias"]["rms_deg_per_h"] < 3.0 * found["bias"]["sigma_deg_per_h"]
+    errors = json.loads((tmp_path / "out" / "errors.json").read_text())
+    assert 0.3 < errors["given"]["all samples"]["total"]["rms_over_sigma"] < 3.0
+    assert 0.0 < errors["bias"]["rms_deg_per_h"] < 3.0 * errors["bias"]["sigma_deg_per_h"]
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         assert np.array_equal(file["truth/attitude"][:], truth.attitude)
 
@@ -124,7 +124,7 @@ def test_a_lost_filter_says_that_it_recovered(succeeds, record, tmp_path):
 
 def test_what_a_record_does_not_hold_is_asked_for(refusal, record, tmp_path):
     bare = tmp_path / "bare.h5"
-    whole = simulate(made(STARS[:1]), 4)
+    whole = simulate(scenario_of(STARS[:1]), 4)
     write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
     (tmp_path / "own.csv").write_text("time,gx,gy,gz\n")
     cases = (
@@ -153,7 +153,7 @@ def test_what_a_record_does_not_hold_is_asked_for(refusal, record, tmp_path):
 def test_the_first_measurements_start_the_filter_where_its_sigma_says(sensors):
     errors = []
     for run_number in range(20):
-        record = simulate(made(sensors, 1.0), 8, run_number)
+        record = simulate(scenario_of(sensors, 1.0), 8, run_number)
         state = estimation.first_state(record, NOISE, bias_sigma=2e-3)
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), record.truth.attitude[0]))
         errors.append(e @ np.linalg.solve(state.covariance[:3, :3], e) * PRIOR_INFLATION**2 / 3.0)
@@ -161,7 +161,7 @@ def test_the_first_measurements_start_the_filter_where_its_sigma_says(sensors):
 
 
 def test_an_outlier_among_the_first_measurements_does_not_start_the_filter():
-    record = simulate(made(), 8)
+    record = simulate(scenario_of(), 8)
     a, b = record.vectors
     wrong = a.vector_b.copy()
     wrong[0] = [0.0, 0.0, 1.0]
@@ -185,7 +185,7 @@ def test_faults_do_not_hide_that_a_start_is_missing():
         ),
     )
     with pytest.raises(InputError, match="0 of directions"):
-        estimation.first_state(simulate(made(blind), 1), NOISE, bias_sigma=1e-3)
+        estimation.first_state(simulate(scenario_of(blind), 1), NOISE, bias_sigma=1e-3)
 
 
 # ---------------------------------------------------------------------------------------------------- optional states, one direction
@@ -228,19 +228,19 @@ def test_states_that_the_errors_call_for(run, succeeds, spinning, tmp_path, monk
     (tmp_path / "filter.toml").write_text(setup.to_toml(saved))
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 100)
     succeeds("estimate", spinning, "--out", tmp_path / "again", *options)
-    one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("out", "again"))
-    assert np.array_equal(one.attitude, other.attitude)
-    assert np.array_equal(one.covariance, other.covariance)
+    estimate, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("out", "again"))
+    assert np.array_equal(estimate.attitude, other.attitude)
+    assert np.array_equal(estimate.covariance, other.covariance)
 
 
 def test_what_a_record_shows_of_each_state(succeeds, spinning, tmp_path):
     said = succeeds("estimate", spinning, "--out", tmp_path / "out", "--observability", "--states")
     assert "directions are observed" in said
     saved = json.loads((tmp_path / "out" / "observability.json").read_text())
-    names = [one["state"] for one in saved["states"]]
+    names = [state["state"] for state in saved["states"]]
     assert len(names) == len(saved["directions"]) >= 7
-    assert saved["rank"] == sum(one["singular_value"] >= saved["threshold"] for one in saved["directions"])
-    assert {one["unit"] for one in saved["states"][:6]} == {"rad", "rad/s"}
+    assert saved["rank"] == sum(direction["singular_value"] >= saved["threshold"] for direction in saved["directions"])
+    assert {state["unit"] for state in saved["states"][:6]} == {"rad", "rad/s"}
     assert set(saved["directions"][0]["one_sigma_left"]) == set(names)
 
 
@@ -302,7 +302,7 @@ def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, succ
     assert "only an error of σ of ×" in headline
     assert "no state for the gyro's scale factor of 200 ppm, the gyro's flicker of 0.3 °/h" in headline
     parts = json.loads((tmp_path / "check.json").read_text())["parts"]
-    errors = {one["of"]: one["detectable_error"] for one in parts}
+    errors = {part["of"]: part["detectable_error"] for part in parts}
     assert errors["attitude"] < 1.5
     assert 1.5 < errors["bias"] < 2.6
 
@@ -311,12 +311,12 @@ def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, succ
 def test_the_detectable_error_of_a_bias_is_that_of_many_runs(satellite):
     """An error of σ by the reported factor is contradicted in nearly all of 30 runs, one of 1.2 in fewer than half."""
     scenario = scenarios.load_scenario(satellite)
-    chosen, runs = setup.FilterSetup.for_scenario(scenario, states=False), []
+    filter_setup, runs = setup.FilterSetup.for_scenario(scenario, states=False), []
     for seed in range(30):
         record = simulate(scenario, 1000 + seed)
-        draw = chosen.attitude_sigma * np.random.default_rng(seed).standard_normal(3)
-        start = setup.initial_state(chosen, quaternion.multiply(record.truth.attitude[0], quaternion.exp(draw)))
-        estimate = setup.run(record, chosen, start, full_covariance=True)
+        draw = filter_setup.attitude_sigma * np.random.default_rng(seed).standard_normal(3)
+        start = setup.initial_state(filter_setup, quaternion.multiply(record.truth.attitude[0], quaternion.exp(draw)))
+        estimate = setup.run(record, filter_setup, start, full_covariance=True)
         runs.append(dataclasses.replace(estimate, truth=record.truth))
 
     def of_bias(estimate, factor):
@@ -326,16 +326,18 @@ def test_the_detectable_error_of_a_bias_is_that_of_many_runs(satellite):
             estimate, covariance=estimate.covariance * np.outer(scale, scale), variance=estimate.variance * scale**2
         )
         judged = consistency.judge(scaled)
-        findings = [one for one in judged.findings if (one.name, one.of) == ("time-averaged NEES", "bias")]
-        return findings, next(one.detectable_error for one in judged.parts if one.of == "bias")
+        findings = [
+            finding for finding in judged.findings if (finding.name, finding.of) == ("time-averaged NEES", "bias")
+        ]
+        return findings, next(part.detectable_error for part in judged.parts if part.of == "bias")
 
     first = [of_bias(estimate, 1.0) for estimate in runs]
-    wrong = np.sqrt(np.mean([one.value for findings, _ in first for one in findings]))
+    wrong = np.sqrt(np.mean([finding.value for findings, _ in first for finding in findings]))
     reported = np.median([error for _, error in first])
     assert 1.5 < reported < 2.6
     for factor, low, high in ((reported, 0.85, 1.0), (1.2, 0.0, 0.5)):
-        seen = [any(one.rejected for one in of_bias(estimate, factor / wrong)[0]) for estimate in runs]
-        assert low <= np.mean(seen) <= high
+        rejected = [any(finding.rejected for finding in of_bias(estimate, factor / wrong)[0]) for estimate in runs]
+        assert low <= np.mean(rejected) <= high
 
 
 @pytest.mark.slow
@@ -398,7 +400,7 @@ def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(succeeds, r
 
 def test_directions_that_contradict_each_other_start_nothing(refusal, tmp_path):
     """A star taken for another: no bank makes a start of that, unless the filter has states for what sensors get wrong."""
-    whole = simulate(made(), 4)
+    whole = simulate(scenario_of(), 4)
     first, *others = whole.vectors
     wrong = dataclasses.replace(first, reference_f=np.array([0.6, 0.8, 0.0]))
     path = tmp_path / "mixed.h5"
@@ -441,9 +443,9 @@ def test_a_record_is_smoothed(succeeds, record, tmp_path):
     np.testing.assert_array_equal(smoothed.time, plain.time)
     assert np.all(smoothed.variance <= plain.variance * (1.0 + 1e-9))
     assert np.mean(smoothed.variance[:150]) < 0.5 * np.mean(plain.variance[:150])
-    found, before = (json.loads((tmp_path / name / "errors.json").read_text()) for name in ("out", "plain"))
-    assert found["bias"]["sigma_deg_per_h"] < before["bias"]["sigma_deg_per_h"]
-    assert 0.4 < found["given"]["all samples"]["total"]["rms_over_sigma"] < 1.7
+    errors, before = (json.loads((tmp_path / name / "errors.json").read_text()) for name in ("out", "plain"))
+    assert errors["bias"]["sigma_deg_per_h"] < before["bias"]["sigma_deg_per_h"]
+    assert 0.4 < errors["given"]["all samples"]["total"]["rms_over_sigma"] < 1.7
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         assert file.attrs["smoothed"]
 
@@ -476,13 +478,13 @@ def test_smoothing_with_states_holds_them(succeeds, tmp_path):
 @pytest.fixture
 def recording(tmp_path):
     """A simulated hand as CSV, its samples 5 ms late."""
-    one = hand_held.simulated(1, 0, 12.0)
-    one = dataclasses.replace(one, time=one.time + 0.005)
+    samples = hand_held.simulated(1, 0, 12.0)
+    samples = dataclasses.replace(samples, time=samples.time + 0.005)
     path = tmp_path / "hand.csv"
     header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
     np.savetxt(
         path,
-        np.column_stack([one.time, one.rate, one.specific_force, one.magnetic_field]),
+        np.column_stack([samples.time, samples.rate, samples.specific_force, samples.magnetic_field]),
         delimiter=",",
         header=header,
         comments="",
@@ -561,7 +563,7 @@ def test_gate_robust_weights_and_observability_of_a_recording(succeeds, recordin
         used = setup.from_toml(file.attrs["filter"].decode())
     assert (used.gate.probability, used.robust.kind) == (0.999, "student")
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
-    assert all(one.weight is not None for one in estimate.innovations.values())
+    assert all(innovations.weight is not None for innovations in estimate.innovations.values())
     assert off(tmp_path / "out", 0.0) < 1.5
 
 

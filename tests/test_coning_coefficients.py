@@ -163,11 +163,11 @@ def test_published_rate_weights():
 def test_the_drift_orders_of_the_catalogue():
     """2M of what is optimal under coning, the order of the fit of what is exact for a rate polynomial, that of each scheme."""
     fitted = {n: n + 1 + (n % 2 == 0) for n in range(1, 9)}
-    for name, one in ALGORITHMS.items():
+    for name, algorithm in ALGORITHMS.items():
         of_fit = name.startswith(("time-taylor", "polynomial"))
-        of_scheme = one.solver not in ("compressed", "pairs", "polynomial")
-        expected = one.order if of_scheme else fitted[one.samples] if of_fit else 2 * one.window
-        assert one.drift_order == expected, name
+        of_scheme = algorithm.solver not in ("compressed", "pairs", "polynomial")
+        expected = algorithm.order if of_scheme else fitted[algorithm.samples] if of_fit else 2 * algorithm.window
+        assert algorithm.drift_order == expected, name
 
 
 @pytest.mark.parametrize("name", ["four-sample", "time-taylor-3", "matched-2-8", "four-sample-rate-2"])

@@ -440,9 +440,9 @@ def test_rate_samples_cost_what_the_docstring_says():
         return 2 * (last[3] - error[3]) / (t[-1] - t[200]) / (cone.angle**2 * 2 * math.pi)
 
     naive = coning.integrate(coning.increments_from_rates(cone.body_rate(t), h, 2), "two-sample", true[0])
-    made = integrated_rates(cone.body_rate(t), h, "two-sample-rate-2", true[0])
+    for_rates = integrated_rates(cone.body_rate(t), h, "two-sample-rate-2", true[0])
     assert drift(naive) == pytest.approx(-(lam**2) / 12, rel=0.05)
-    assert drift(made) == pytest.approx(-float(ALGORITHMS["two-sample-rate-2"].drift_constant) * lam**4, rel=0.05)
+    assert drift(for_rates) == pytest.approx(-float(ALGORITHMS["two-sample-rate-2"].drift_constant) * lam**4, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -511,8 +511,8 @@ def test_savages_two_speed_algorithm_is_its_published_recursion(samples):
             beta = beta + 0.5 * np.cross(alpha + increments[i - 1] / 6.0, increments[i])
             alpha = alpha + increments[i]
         expected.append(alpha + beta)
-    found = coning.rotation_vectors(increments, two_speed(samples))
-    np.testing.assert_allclose(found[1:], expected, rtol=0.0, atol=1e-15)
+    rotations = coning.rotation_vectors(increments, two_speed(samples))
+    np.testing.assert_allclose(rotations[1:], expected, rtol=0.0, atol=1e-15)
 
 
 def test_savages_two_speed_algorithm_drifts_as_its_table_says():
@@ -557,18 +557,18 @@ def test_a_pair_table_over_a_window_keeps_its_order_up_to_both_ends(previous, fo
                 n**3 / 12.0 * np.cross(a0, b0) + n**4 / 12.0 * np.cross(a0, c) + n**5 / 60.0 * np.cross(b0, c)
             )
             expected.append(first_order + second_order)
-        found = coning.rotation_vectors(increments, table)
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
+        rotations = coning.rotation_vectors(increments, table)
+        np.testing.assert_allclose(rotations, expected, rtol=0.0, atol=1e-14)
 
 
 class Strict(np.ndarray):
     """An array that refuses what NumPy, and compiled code with it, would read elsewhere: negative indices, and those beyond the end."""
 
     def _check(self, index):
-        for one, size in zip(index if isinstance(index, tuple) else (index,), self.shape, strict=False):
-            ends = (one.start, one.stop) if isinstance(one, slice) else (one,)
+        for item, size in zip(index if isinstance(index, tuple) else (index,), self.shape, strict=False):
+            ends = (item.start, item.stop) if isinstance(item, slice) else (item,)
             for end in ends:
-                if end is not None and not 0 <= end <= (size if isinstance(one, slice) else size - 1):
+                if end is not None and not 0 <= end <= (size if isinstance(item, slice) else size - 1):
                     raise IndexError(f"{index} of an array of shape {self.shape}")
 
     def __getitem__(self, index):
@@ -608,9 +608,9 @@ def test_no_kernel_reads_or_writes_outside_its_arrays(monkeypatch):
     for table in tables:
         for length in {0, 1, table.samples - 1, table.samples, table.window - 1, table.window + table.samples + 1}:
             increments = 0.05 * generator.standard_normal((length, 3))
-            found = coning.rotation_vectors(increments, table)
-            assert found.shape == (length // table.samples, 3)
-            assert np.all(np.isfinite(found))
+            rotations = coning.rotation_vectors(increments, table)
+            assert rotations.shape == (length // table.samples, 3)
+            assert np.all(np.isfinite(rotations))
             # Products are of second order in turns of a tenth of a radian.
-            sums = increments[: len(found) * table.samples].reshape(-1, table.samples, 3).sum(axis=1)
-            assert np.all(np.abs(found - sums) < 0.5)
+            sums = increments[: len(rotations) * table.samples].reshape(-1, table.samples, 3).sum(axis=1)
+            assert np.all(np.abs(rotations - sums) < 0.5)

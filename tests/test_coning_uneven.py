@@ -60,8 +60,8 @@ def test_two_samples_have_the_known_closed_form():
     first, second = np.array([1.1e-3, -0.4e-3, 0.7e-3]), np.array([-0.2e-3, 0.9e-3, 1.3e-3])
     for h1, h2 in ((0.3, 0.7), (0.25, 0.1), (1.0, 1.01)):
         expected = first + second + (h1 + h2) ** 2 / (6.0 * h1 * h2) * np.cross(first, second)
-        found = coning.rotation_vectors([first, second], "two-sample", edges=[5.0, 5.0 + h1, 5.0 + h1 + h2])
-        np.testing.assert_allclose(found[0], expected, atol=2e-9)  # the third product of such angles
+        rotations = coning.rotation_vectors([first, second], "two-sample", edges=[5.0, 5.0 + h1, 5.0 + h1 + h2])
+        np.testing.assert_allclose(rotations[0], expected, atol=2e-9)  # the third product of such angles
         assert np.abs(np.cross(first, second)).max() > 1e-6
 
 
@@ -82,8 +82,8 @@ def test_polynomial_rates_are_integrated_to_rounding(name, degree):
 
     increments = np.array([angle(b) - angle(a) for a, b in itertools.pairwise(edges)])
     true = solve_ivp(derivative, (0.0, edges[-1]), [1.0, 0.0, 0.0, 0.0], "DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-    found = coning.integrate(increments, name, edges=edges)[-1]
-    assert quaternion.angle_between(found, true / np.linalg.norm(true)) < 1e-12
+    attitude = coning.integrate(increments, name, edges=edges)[-1]
+    assert quaternion.angle_between(attitude, true / np.linalg.norm(true)) < 1e-12
     assert quaternion.angle_between(coning.integrate(increments, name)[-1], true / np.linalg.norm(true)) > 1e-6
 
 
@@ -117,11 +117,11 @@ def test_a_gap_is_a_turn_at_constant_rate_and_no_step_beyond_its_window_hears_of
     edges = EVEN[:241] + np.where(np.arange(241) > 121, 40.0 / RATE, 0.0)
     increments = CONE.increments(EVEN[:241])
     increments[121] = [0.3, -0.2, 0.5]
-    found, even = (coning.rotation_vectors(increments, name, edges=e) for e in (edges, EVEN[:241]))
+    rotations, even = (coning.rotation_vectors(increments, name, edges=e) for e in (edges, EVEN[:241]))
     row = 121 // table.samples
     reach = -(-max(table.previous, table.following) // table.samples)
-    far = np.abs(np.arange(len(found)) - row) > reach
-    np.testing.assert_array_equal(found[far], even[far])
+    far = np.abs(np.arange(len(rotations)) - row) > reach
+    np.testing.assert_array_equal(rotations[far], even[far])
     # The gap's own part of the step is exp(Δθ) between the others.
     inside = increments[row * table.samples : (row + 1) * table.samples]
     place = 121 - row * table.samples
@@ -134,7 +134,7 @@ def test_a_gap_is_a_turn_at_constant_rate_and_no_step_beyond_its_window_hears_of
     for part in parts:
         turn = quaternion.multiply(turn, quaternion.exp(part[0]))
     if table.samples > 1:  # else the neighbours are outside the step
-        np.testing.assert_allclose(quaternion.exp(found[row]), turn, atol=1e-12)
+        np.testing.assert_allclose(quaternion.exp(rotations[row]), turn, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["four-sample", "eight-sample", "matched-2-8", "matched-4-11", "matched-1-8-8"])
@@ -145,9 +145,9 @@ def test_noise_is_not_blown_up(name, shortest):
     length = shortest + (1.4 - shortest) * random.random(2400)
     turn = np.outer(length, [0.0, 0.0, 0.02])
     noise = 1e-6 * random.standard_normal((2400, 3))
-    found = coning.rotation_vectors(turn + noise, name, edges=np.concatenate([[0.0], np.cumsum(length)]))
+    rotations = coning.rotation_vectors(turn + noise, name, edges=np.concatenate([[0.0], np.cumsum(length)]))
     n = ALGORITHMS[name].samples
-    left = found - (turn + noise).reshape(-1, n, 3).sum(axis=1)
+    left = rotations - (turn + noise).reshape(-1, n, 3).sum(axis=1)
     assert np.sqrt(np.mean(left**2)) < 6.0 * 0.02 * 1e-6
     assert np.abs(left).max() < 40.0 * 0.02 * 1e-6
 

@@ -169,13 +169,13 @@ def test_log_mean_bounds_hold_their_tails(degrees, samples):
 
 def test_autocorrelation_by_the_sum():
     z = np.random.default_rng(6).standard_normal((200, 2))
-    found = consistency.autocorrelation(z, 5)
+    correlation = consistency.autocorrelation(z, 5)
     for lag in range(1, 6):
         for k in range(2):
             expected = sum(z[i + lag, k] * z[i, k] for i in range(200 - lag)) / sum(z[:, k] ** 2)
-            assert found.values[lag - 1, k] == pytest.approx(expected)
-    assert found.bounds[0] == pytest.approx(2.5758 * math.sqrt(199 / (200 * 202)), rel=1e-4)
-    assert np.all(found.simultaneous_bounds > found.bounds)
+            assert correlation.values[lag - 1, k] == pytest.approx(expected)
+    assert correlation.bounds[0] == pytest.approx(2.5758 * math.sqrt(199 / (200 * 202)), rel=1e-4)
+    assert np.all(correlation.simultaneous_bounds > correlation.bounds)
 
 
 def test_the_usual_lags_are_a_fiftieth_of_the_samples_from_1_to_20():
@@ -324,18 +324,18 @@ def test_a_wrong_sigma_leaves_the_effective_samples_of_white_errors(epochs, fact
     """A constant excess of the NEES is no correlation: nearly every epoch counts, and the average shows the factor."""
     random = np.random.default_rng(int(1000 * factor) + epochs)
     error = factor * random.standard_normal((epochs, 3))
-    found = consistency.timeaverage.time_average(error, np.tile(np.eye(3), (epochs, 1, 1)))
-    assert found.reliable
-    assert 0.6 * epochs < found.effective <= epochs
-    assert found.mean == pytest.approx(factor**2, rel=0.15)
-    assert (consistency.mean_p_value(found.mean, 3, found.effective) < 1e-3) == (factor != 1.0)
+    average = consistency.timeaverage.time_average(error, np.tile(np.eye(3), (epochs, 1, 1)))
+    assert average.reliable
+    assert 0.6 * epochs < average.effective <= epochs
+    assert average.mean == pytest.approx(factor**2, rel=0.15)
+    assert (consistency.mean_p_value(average.mean, 3, average.effective) < 1e-3) == (factor != 1.0)
 
 
 def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
     walk = np.cumsum(np.random.default_rng(19).standard_normal((60, 2)), axis=0)
-    found = consistency.time_average(walk, np.broadcast_to(30.0 * np.eye(2), (60, 2, 2)))
-    assert not found.reliable
-    assert 0.001 < consistency.mean_p_value(found.mean, 2, max(found.effective, 1.0)) < 1.0
+    average = consistency.time_average(walk, np.broadcast_to(30.0 * np.eye(2), (60, 2, 2)))
+    assert not average.reliable
+    assert 0.001 < consistency.mean_p_value(average.mean, 2, max(average.effective, 1.0)) < 1.0
     with pytest.raises(InputError, match="too few"):
         consistency.time_average(walk[:4], np.broadcast_to(np.eye(2), (4, 2, 2)))
 
@@ -353,11 +353,11 @@ def test_convergence_time_is_that_of_the_last_excursion():
 @pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
 def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
     """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""
-    found = bounds.coverage_p_values(np.full(3, inside / samples), samples)
+    p_values = bounds.coverage_p_values(np.full(3, inside / samples), samples)
     for k, p in enumerate(math.erf(s / math.sqrt(2.0)) for s in (1, 2, 3)):
         terms = [math.comb(samples, j) * p**j * (1.0 - p) ** (samples - j) for j in range(samples + 1)]
         wanted = min(1.0, 2.0 * min(math.fsum(terms[: inside + 1]), math.fsum(terms[inside:])))
-        assert found[k] == pytest.approx(wanted, rel=1e-9)
+        assert p_values[k] == pytest.approx(wanted, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -367,8 +367,8 @@ def test_the_p_value_of_anderson_and_darling_is_that_of_the_table(critical, leve
     """D'Agostino & Stephens (1986), table 4.7: the levels of A²*, on samples bent until they have just that statistic."""
     normal = scipy.stats.norm.ppf((np.arange(300) + 0.5) / 300)[:, None]
 
-    def found(bent):
+    def anderson_darling(bent):
         return whiteness.anderson_darling(np.sinh(bent * normal))
 
-    bent = scipy.optimize.brentq(lambda x: found(x)[0] - critical, 0.05, 3.0)
-    assert found(bent)[1] == pytest.approx(level, rel=0.04)
+    bent = scipy.optimize.brentq(lambda x: anderson_darling(x)[0] - critical, 0.05, 3.0)
+    assert anderson_darling(bent)[1] == pytest.approx(level, rel=0.04)

@@ -154,10 +154,10 @@ def test_variances_alone_judge_the_end_by_axes():
     )
     assert any("variances only" in limit for limit in good.limits)
     bad = consistency.judge(*estimate(covariance=False, bias_error=10.0))
-    (found,) = (f for f in bad.findings if f.rejected)
-    assert (found.name, found.of) == ("error at the end", "bias z")
-    assert found.p_value == pytest.approx(
-        6.0 * 2.0 * scipy.stats.chi2.sf(found.value**2, 1), rel=1e-6, abs=0.0
+    (finding,) = (f for f in bad.findings if f.rejected)
+    assert (finding.name, finding.of) == ("error at the end", "bias z")
+    assert finding.p_value == pytest.approx(
+        6.0 * 2.0 * scipy.stats.chi2.sf(finding.value**2, 1), rel=1e-6, abs=0.0
     )  # of six
 
 
@@ -201,12 +201,12 @@ def test_a_sigma_wrong_by_the_power_stated_is_found():
     """At the stated factor, too small or too large, the verdict is "not consistent" in 97 % of runs or more, and mostly not at a third of
     its logarithm."""
     right = consistency.judge(*estimate())
-    power = {one.of: one.detectable_error for one in right.parts}
+    power = {part.of: part.detectable_error for part in right.parts}
     assert set(power) == {"innovations of star 1", "innovations of star 2", "attitude", "bias"}
     factor = power["innovations of star 1"]
     for scale in (factor, 1.0 / factor):
-        found = [consistency.judge(estimate(scale, seed=seed)[0]).verdict for seed in range(40)]
-        assert found.count("not consistent") >= 39
+        verdicts = [consistency.judge(estimate(scale, seed=seed)[0]).verdict for seed in range(40)]
+        assert verdicts.count("not consistent") >= 39
     near = [consistency.judge(estimate(factor**0.33, seed=seed)[0]).verdict for seed in range(40)]
     assert near.count("not consistent") < 30
 
@@ -217,13 +217,13 @@ def test_a_state_that_nothing_tests_is_named():
     assert blind.headline.startswith(
         "cannot tell: innovations consistent; attitude and bias not testable from this run: no truth for it; detectable error of σ: "
     )
-    assert all(math.isinf(one.detectable_error) for one in blind.parts if not one.of.startswith("innovations"))
+    assert all(math.isinf(part.detectable_error) for part in blind.parts if not part.of.startswith("innovations"))
     assert any("the σ of gyro.scale is not tested: no truth for it" in limit for limit in blind.limits)
     spec = GyroSpec(angle_random_walk=1e-5, asymmetry=(9e-6, 0.0, 0.0))
     noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
     setup = FilterSetup(process_noise=noise, bias_sigma=1e-3)
-    seen = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
-    assert seen.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
+    judgement = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
+    assert judgement.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
     plain = json.loads(json.dumps(blind.summary(), allow_nan=False))["parts"]
     assert plain[-1] == {"of": "bias", "detectable_error": None, "why": "no truth for it"}
 
@@ -233,14 +233,14 @@ def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
     for scale, status in ((0.1, "cannot tell"), (1.0, "cannot tell"), (1.2, "not consistent")):
         judged = consistency.judge(of_a_recording(estimate(scale, correlated=True)[0]))
         assert judged.verdict == status
-        assert {one.name for one in judged.findings} == {"NIS"}
+        assert {finding.name for finding in judged.findings} == {"NIS"}
     judged = consistency.judge(of_a_recording(estimate(0.1)[0]))
     assert "innovations within σ; attitude and bias not testable from this run: no truth for it" in judged.reason
     assert "RMS over σ: innovations of star 1 0.1" in judged.reason
     small, truth = estimate(0.1)
     small = consistency.judge(of_a_recording(small), truth)
     assert small.verdict == "consistent"
-    assert all(one.low <= one.value <= one.high for one in small.findings)  # as it passes
+    assert all(finding.low <= finding.value <= finding.high for finding in small.findings)  # as it passes
     large, truth = estimate(0.1, bias_error=10.0)
     assert consistency.judge(of_a_recording(large), truth).verdict == "not consistent"
 
@@ -317,11 +317,11 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
     counts = np.tile(usual, (21, 6, 1))
     counts[20, 4, 0] = 82
     judged = replace(few, coverage=counts).judge(epochs=np.array([10, 20]))
-    (found,) = (one for one in judged.findings if one.name == "coverage")
+    (coverage,) = (finding for finding in judged.findings if finding.name == "coverage")
     least = 2.0 * scipy.stats.binom.sf(81, 100, math.erf(math.sqrt(0.5)))
-    assert (found.of, found.value) == ("bias y", 0.82)
-    assert found.p_value == pytest.approx(36 * least, rel=1e-9)
-    assert "82 % of the bias y errors lie within 1 σ" in found.means
+    assert (coverage.of, coverage.value) == ("bias y", 0.82)
+    assert coverage.p_value == pytest.approx(36 * least, rel=1e-9)
+    assert "82 % of the bias y errors lie within 1 σ" in coverage.means
 
 
 def test_few_runs_cannot_tell(plan):
@@ -356,31 +356,35 @@ def test_bounds_are_those_that_decide(plan):
     for scale in np.linspace(1.0, 1.12, 13):
         judgement = consistency.judge(*estimate(scale, seed=4))
         decided += [
-            (one.low <= one.value <= one.high, one.rejected, one.p_value) for one in judgement.findings if one.is_ratio
+            (finding.low <= finding.value <= finding.high, finding.rejected, finding.p_value)
+            for finding in judgement.findings
+            if finding.is_ratio
         ]
     assert all(inside is not rejected for inside, rejected, _ in decided)
     assert any(inside and p < 0.01 for inside, _, p in decided)  # alone it would have been rejected
     for factor in (1.0, 0.97, 0.8):
         judgement = statistics_of(plan, measurement_sigma_factor=factor).judge()
-        bounded = [one for one in judgement.findings if math.isfinite(one.low)]
-        assert {one.name for one in bounded} == {"ANEES", "log-NEES", "NIS"}
-        assert all((one.low <= one.value <= one.high) is not one.rejected for one in bounded)
-        assert all(re.fullmatch(r"worst of 20 epochs \(\d+ s\)", one.at) for one in bounded if one.name != "NIS")
+        bounded = [finding for finding in judgement.findings if math.isfinite(finding.low)]
+        assert {finding.name for finding in bounded} == {"ANEES", "log-NEES", "NIS"}
+        assert all((finding.low <= finding.value <= finding.high) is not finding.rejected for finding in bounded)
+        assert all(
+            re.fullmatch(r"worst of 20 epochs \(\d+ s\)", finding.at) for finding in bounded if finding.name != "NIS"
+        )
 
 
 # ---------------------------------------------------------------------------------------------------------------- the command
 
 
 @pytest.mark.parametrize(
-    ("made", "status", "verdict"),
+    ("options", "status", "verdict"),
     [
         ({}, 3, "cannot tell: innovations consistent; attitude and bias not testable from this run"),
         ({"scale": 1.3}, 1, "not consistent: "),
         ({"samples": 8}, 3, "cannot tell: "),
     ],
 )
-def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, verdict):
-    result, _ = estimate(**made)
+def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, options, status, verdict):
+    result, _ = estimate(**options)
     write_estimate("estimate.h5", result)
     ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
     assert ended == status

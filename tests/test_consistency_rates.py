@@ -64,9 +64,9 @@ def test_autocorrelation_bounds_hold():
     random = np.random.default_rng(4)
     outside, jointly = 0, 0
     for _ in range(2000):
-        found = consistency.autocorrelation(random.standard_normal((500, 1)), 10, 0.95)
-        outside += np.sum(np.abs(found.values[:, 0]) > found.bounds)
-        jointly += np.any(np.abs(found.values[:, 0]) > found.simultaneous_bounds)
+        correlation = consistency.autocorrelation(random.standard_normal((500, 1)), 10, 0.95)
+        outside += np.sum(np.abs(correlation.values[:, 0]) > correlation.bounds)
+        jointly += np.any(np.abs(correlation.values[:, 0]) > correlation.simultaneous_bounds)
     assert abs(outside / 20_000 - 0.05) < 0.007
     assert abs(jointly / 2000 - 0.05) < 0.02
 
@@ -152,8 +152,8 @@ def satellite(duration=300.0):
         duration=duration,
         gravity_f=(0.0, 0.0, 0.0),
     )
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+    return montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=50, individuals=True)
 
 
 @pytest.mark.slow
@@ -175,35 +175,35 @@ def coloured(correlation_time):
         sensors=(replace(base.sensors[0], faults=faults),),
         gyro=GyroSpec(angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=2.4e-8),
     )
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+    return montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=50, individuals=True)
 
 
 def verdicts_of_runs(plan, runs):
     """The verdict on single runs of a plan, each of its own gyro."""
-    found = []
+    verdicts = []
     for run in range(runs):
         again = montecarlo.replay(plan, run, machine="scalar")
-        found.append(consistency.judge(again.estimate, again.record.truth).verdict)
-    return found
+        verdicts.append(consistency.judge(again.estimate, again.record.truth).verdict)
+    return verdicts
 
 
 def verdicts_of_campaigns(campaigns, runs):
     """The verdict on campaigns of the lanes, of a right filter."""
     scenario = replace(scenarios.load_scenario("two-stars"), duration=20.0)
-    found = []
+    verdicts = []
     for seed in range(campaigns):
         plan = montecarlo.Plan(
             scenario=scenario, setup=setup.FilterSetup.for_scenario(scenario, states=False), seed=seed, epochs=40
         )
-        found.append(montecarlo.run_plan(plan, runs=runs, threads=1).judge().verdict)
-    return found
+        verdicts.append(montecarlo.run_plan(plan, runs=runs, threads=1).judge().verdict)
+    return verdicts
 
 
 def test_few_campaigns_of_a_right_filter_are_called_wrong():
-    found = verdicts_of_campaigns(20, 160)
-    assert found.count("not consistent") <= 2
-    assert found.count("consistent") >= 18  # and 160 runs suffice
+    verdicts = verdicts_of_campaigns(20, 160)
+    assert verdicts.count("not consistent") <= 2
+    assert verdicts.count("consistent") >= 18  # and 160 runs suffice
 
 
 @pytest.mark.slow

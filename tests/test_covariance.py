@@ -97,32 +97,32 @@ def white(name, duration, **gyro):
 def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
     scenario = white(name, min(load_scenario(name).duration, 60.0))
     belief = setup.FilterSetup.for_scenario(scenario, states=False)
-    found = covariance.analyse(scenario, belief, epochs=5)
-    scale = found.filter_sigma[:, :, None] * found.filter_sigma[:, None, :]
-    assert np.abs((found.covariance - found.filter_covariance) / scale).max() < 1e-11
-    assert np.allclose(found.filter_covariance, np.swapaxes(found.filter_covariance, 1, 2))
-    assert np.abs((found.contributions.sum(axis=1) - found.filter_covariance) / scale).max() < 1e-11
-    for value in found.expected_nis.values():
+    analysis = covariance.analyse(scenario, belief, epochs=5)
+    scale = analysis.filter_sigma[:, :, None] * analysis.filter_sigma[:, None, :]
+    assert np.abs((analysis.covariance - analysis.filter_covariance) / scale).max() < 1e-11
+    assert np.allclose(analysis.filter_covariance, np.swapaxes(analysis.filter_covariance, 1, 2))
+    assert np.abs((analysis.contributions.sum(axis=1) - analysis.filter_covariance) / scale).max() < 1e-11
+    for value in analysis.expected_nis.values():
         assert value == pytest.approx(1.0, abs=1e-4)
-    names = {name for name, *_ in found.budget()}
+    names = {name for name, *_ in analysis.budget()}
     assert {"angle random walk", "initial attitude", "initial bias"} <= names
     for epoch in (2, -1):  # squares add up, as the mean over the axes of attitude and bias
-        squares = np.array([row[2:] for row in found.budget(epoch) if row[1] == "random"]) ** 2
-        whole = np.diag(found.covariance[epoch]).reshape(2, 3).mean(axis=1)
+        squares = np.array([row[2:] for row in analysis.budget(epoch) if row[1] == "random"]) ** 2
+        whole = np.diag(analysis.covariance[epoch]).reshape(2, 3).mean(axis=1)
         assert np.allclose(squares.sum(axis=0), whole, rtol=1e-7, atol=1e-24)
 
 
 def test_the_axes_of_a_considered_error_are_one_row_of_the_budget():
     scenario = white("spin", 20.0)
     errors = np.arange(1.0, 25.0).reshape(1, 4, 6)
-    found = dataclasses.replace(
+    analysis = dataclasses.replace(
         covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=1),
         fixed=("start",),
         fixed_errors=np.repeat(errors[:, :1], 2, axis=0),
         considered=("mounting, x", "mounting, y", "delay"),
         considered_errors=np.repeat(errors[:, 1:], 2, axis=0),
     )
-    rows = {(name, kind): np.square(rms) for name, kind, *rms in found.budget() if kind != "random"}
+    rows = {(name, kind): np.square(rms) for name, kind, *rms in analysis.budget() if kind != "random"}
     squares = np.square(errors[0]).reshape(4, 2, 3).mean(axis=2)
     assert list(rows) == [("start", "fixed"), ("mounting", "considered"), ("delay", "considered")]
     assert np.allclose(list(rows.values()), [squares[0], squares[1] + squares[2], squares[3]], rtol=1e-12)
@@ -159,18 +159,19 @@ def test_the_filters_covariance_is_that_of_the_filter(integration):
     belief = dataclasses.replace(belief, integration=coning.ALGORITHMS[integration])
     record = simulate(scenario)
     estimate, _ = run_quiet(record, belief, every=30)
-    found = covariance.analyse(scenario, belief, epochs=600 // belief.integration.samples // 30)
-    assert np.array_equal(found.time, estimate.time)
+    analysis = covariance.analyse(scenario, belief, epochs=600 // belief.integration.samples // 30)
+    assert np.array_equal(analysis.time, estimate.time)
     scale = estimate.sigma[:, :, None] * estimate.sigma[:, None, :]
-    assert np.abs((found.filter_covariance - estimate.covariance) / scale).max() < 1e-3  # steps of two samples, for one
+    # steps of two samples, for one
+    assert np.abs((analysis.filter_covariance - estimate.covariance) / scale).max() < 1e-3
 
 
 def test_a_coloured_bias_that_never_changes_is_nothing_but_initial_bias():
     """The filter starts from the whole true bias less its own prior error, so a drift that stands still leaves no error at all."""
     sigma, tau = 1e-4, 1e18
     scenario = still_scenario(markov_noise=sigma * np.sqrt(2.0 / tau), markov_correlation_time=tau)
-    found = covariance.analyse(scenario, BELIEF, epochs=10)
-    block = found.contributions[:, found.sources.index("Gauss–Markov bias")]
+    analysis = covariance.analyse(scenario, BELIEF, epochs=10)
+    block = analysis.contributions[:, analysis.sources.index("Gauss–Markov bias")]
     reach = np.concatenate([np.full(3, sigma * 60.0), np.full(3, sigma)])
     assert np.abs(block / np.outer(reach, reach)).max() < 1e-12
 
@@ -180,11 +181,11 @@ def test_a_coloured_bias_at_an_edge_is_the_mean_of_both_intervals():
     h, tau, white, steps = 10.0, 15.0, 1e-7, 6
     spec = GyroSpec(markov_noise=white, markov_correlation_time=tau)
     scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=1.0 / h, duration=steps * h)
-    found = covariance.analyse(scenario, BELIEF, epochs=steps)
-    block = found.contributions[:, found.sources.index("Gauss–Markov bias")]
+    analysis = covariance.analyse(scenario, BELIEF, epochs=steps)
+    block = analysis.contributions[:, analysis.sources.index("Gauss–Markov bias")]
     k = np.arange(steps + 1)
     C = 0.5 * tau * white**2 * np.exp(-h / tau * np.abs(k[:, None] - k))
-    for n, of_edge in zip(np.round(found.time / h).astype(int), block, strict=True):
+    for n, of_edge in zip(np.round(analysis.time / h).astype(int), block, strict=True):
         rows = np.zeros((2, steps + 1))
         rows[0, :n] -= h
         rows[0, 0] += n * h
@@ -197,8 +198,8 @@ def test_a_coloured_bias_at_an_edge_is_the_mean_of_both_intervals():
 
 def test_markov_noise_without_a_correlation_time_is_a_rate_random_walk():
     scenarios_ = (still_scenario(rate_random_walk=3e-7, markov_noise=4e-7), still_scenario(rate_random_walk=5e-7))
-    one, other = (covariance.analyse(scenario, BELIEF, epochs=5).contributions for scenario in scenarios_)
-    np.testing.assert_allclose(one, other, rtol=1e-12)
+    mixed, other = (covariance.analyse(scenario, BELIEF, epochs=5).contributions for scenario in scenarios_)
+    np.testing.assert_allclose(mixed, other, rtol=1e-12)
 
 
 def test_measurements_in_an_incomplete_last_step_are_not_processed():
@@ -219,15 +220,15 @@ def test_correlated_noise_runs_from_white_to_a_constant():
     for tau in (1e-6, 1e18):
         faults = Faults(correlated_sigma=size, correlation_time=tau)
         sensors = (dataclasses.replace(scenario.sensors[0], faults=faults), *scenario.sensors[1:])
-        found = covariance.analyse(
+        analysis = covariance.analyse(
             dataclasses.replace(scenario, sensors=sensors),
             BELIEF,
             consider=Consider(sensor_bias={"sun": size}),
             epochs=5,
         )
-        coloured = found.contributions[:, found.sources.index("sun, correlated")]
-        white_noise = found.contributions[:, found.sources.index("sun")] * (size / scenario.sensors[0].sigma) ** 2
-        constant = np.einsum("mci,mcj->mij", found.considered_errors, found.considered_errors)
+        coloured = analysis.contributions[:, analysis.sources.index("sun, correlated")]
+        white_noise = analysis.contributions[:, analysis.sources.index("sun")] * (size / scenario.sensors[0].sigma) ** 2
+        constant = np.einsum("mci,mcj->mij", analysis.considered_errors, analysis.considered_errors)
         assert np.allclose(coloured, white_noise if tau < 1.0 else constant, rtol=1e-6, atol=1e-24)
 
 
@@ -239,8 +240,8 @@ def test_correlated_noise_of_two_measurements_lies_between_white_and_constant(ta
     def covariance_of(time):
         faults = Faults(correlated_sigma=size, correlation_time=time)
         sensors = (dataclasses.replace(scenario.sensors[0], faults=faults), *scenario.sensors[1:])
-        found = covariance.analyse(dataclasses.replace(scenario, sensors=sensors), BELIEF, epochs=5)
-        return found.contributions[-1, found.sources.index("sun, correlated")]
+        analysis = covariance.analyse(dataclasses.replace(scenario, sensors=sensors), BELIEF, epochs=5)
+        return analysis.contributions[-1, analysis.sources.index("sun, correlated")]
 
     white_noise, constant = covariance_of(1e-6), covariance_of(1e18)
     expected = white_noise + math.exp(-1.0 / tau) * (constant - white_noise)
@@ -263,8 +264,8 @@ def test_correlated_noise_of_a_heading_pair_is_that_of_its_line_in_fixed_axes():
     errors = np.array(errors[:2]) - errors[2]
     faults = Faults(correlated_sigma=size, correlation_time=1e18)
     noisy = dataclasses.replace(scenario, sensors=(*scenario.sensors[:-1], dataclasses.replace(pair, faults=faults)))
-    found = covariance.analyse(noisy, belief, epochs=10)
-    coloured = found.contributions[:, found.sources.index("gnss, correlated")]
+    analysis = covariance.analyse(noisy, belief, epochs=10)
+    coloured = analysis.contributions[:, analysis.sources.index("gnss, correlated")]
     sigma = np.sqrt(np.einsum("mii->mi", coloured))[1:]
     ratio = (np.einsum("cmi,cmj->mij", errors, errors) - coloured)[1:] / (sigma[:, :, None] * sigma[:, None, :])
     assert np.abs(ratio).max() < 2e-3
@@ -289,7 +290,7 @@ def test_a_wrong_gain_obeys_the_lyapunov_equation():
         bias_sigma=1e-5,
         sigma={"tracker": held_sigma},
     )
-    found = covariance.analyse(scenario, belief, epochs=10)
+    analysis = covariance.analyse(scenario, belief, epochs=10)
     F, H = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0, 0.0]])
 
     def noise(v, u):
@@ -301,11 +302,11 @@ def test_a_wrong_gain_obeys_the_lyapunov_equation():
     actual = solve_discrete_lyapunov(keep @ F, keep @ noise(*true) @ keep.T + gain @ gain.T * true_sigma**2)
     for axis in range(3):
         pick = np.ix_([axis, 3 + axis], [axis, 3 + axis])
-        assert np.allclose(found.filter_covariance[-1][pick], keep @ prior, rtol=1e-7)
-        assert np.allclose(found.covariance[-1][pick], actual, rtol=1e-7)
+        assert np.allclose(analysis.filter_covariance[-1][pick], keep @ prior, rtol=1e-7)
+        assert np.allclose(analysis.covariance[-1][pick], actual, rtol=1e-7)
     ratio = np.trace(np.linalg.solve(keep @ prior, actual)) / 2.0
-    assert np.allclose(found.expected_nees[-1, 0], ratio)
-    assert found.expected_nis["tracker"] == pytest.approx(
+    assert np.allclose(analysis.expected_nees[-1, 0], ratio)
+    assert analysis.expected_nis["tracker"] == pytest.approx(
         (H @ (F @ actual @ F.T + noise(*true)) @ H.T + true_sigma**2)[0, 0] / (prior[0, 0] + held_sigma**2), rel=0.01
     )
 
@@ -317,12 +318,14 @@ def rotated(record, name, epsilon):
     """The record of a sensor that is turned on the body by a rotation vector: it measures an attitude q exp(ε)."""
     turn = quaternion.exp(np.asarray(epsilon))
     series = []
-    for one in record.vectors:
-        changed = one
-        if one.sensor == name and one.attitude is not None:
-            changed = dataclasses.replace(one, attitude=quaternion.multiply(one.attitude, turn))
-        elif one.sensor == name:
-            changed = dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.conjugate(turn), one.vector_b))
+    for measurements in record.vectors:
+        changed = measurements
+        if measurements.sensor == name and measurements.attitude is not None:
+            changed = dataclasses.replace(measurements, attitude=quaternion.multiply(measurements.attitude, turn))
+        elif measurements.sensor == name:
+            changed = dataclasses.replace(
+                measurements, vector_b=quaternion.rotate(quaternion.conjugate(turn), measurements.vector_b)
+            )
         series.append(changed)
     return dataclasses.replace(record, vectors=tuple(series))
 
@@ -330,14 +333,15 @@ def rotated(record, name, epsilon):
 def late(scenario, name, seconds):
     """The record of a sensor that measures later than its stamps say."""
     shifted = tuple(
-        dataclasses.replace(one, phase=one.phase + seconds) if one.name == name else one for one in scenario.sensors
+        dataclasses.replace(sensor, phase=sensor.phase + seconds) if sensor.name == name else sensor
+        for sensor in scenario.sensors
     )
     record, exact = simulate(dataclasses.replace(scenario, sensors=shifted)), simulate(scenario)
     series = []
-    for one, own in zip(record.vectors, exact.vectors, strict=True):
-        here = slice(len(one.time))
-        reference = own.reference_f[here] if one.reference_f.ndim == 2 else one.reference_f
-        series.append(dataclasses.replace(one, time=own.time[here], reference_f=reference))
+    for measurements, own in zip(record.vectors, exact.vectors, strict=True):
+        here = slice(len(measurements.time))
+        reference = own.reference_f[here] if measurements.reference_f.ndim == 2 else measurements.reference_f
+        series.append(dataclasses.replace(measurements, time=own.time[here], reference_f=reference))
     return dataclasses.replace(record, vectors=tuple(series))
 
 
@@ -354,8 +358,8 @@ def considered(name, size):
     sensor, what = name.split(" ", 1)
     if what == "bias, x":
         iron = tuple(
-            dataclasses.replace(one, hard_iron=np.array([size, 0.0, 0.0])) if one.name == sensor else one
-            for one in base.sensors
+            dataclasses.replace(item, hard_iron=np.array([size, 0.0, 0.0])) if item.name == sensor else item
+            for item in base.sensors
         )
         # The unit of the consideration is that of the sensor's own σ, which the quiet one has too.
         return base, belief, Consider(sensor_bias={sensor: size}), simulate(dataclasses.replace(base, sensors=iron))
@@ -378,12 +382,12 @@ CASES = {
 def test_a_considered_error_makes_what_it_makes(name):
     base, belief, consider, record = considered(name, CASES[name])
     _, error = run_quiet(record, belief, every=60)
-    found = covariance.analyse(base, belief, consider=consider, epochs=10)
-    predicted = found.considered_errors[:, found.considered.index(name)]
+    analysis = covariance.analyse(base, belief, consider=consider, epochs=10)
+    predicted = analysis.considered_errors[:, analysis.considered.index(name)]
     scale = np.concatenate([np.full(3, np.abs(predicted[:, :3]).max()), np.full(3, np.abs(predicted[:, 3:]).max())])
-    assert np.abs((error - found.mean_error - predicted)[1:] / scale).max() < 0.02
-    assert np.allclose(found.covariance - found.contributions.sum(axis=1), np.einsum(
-        "mci,mcj->mij", found.considered_errors, found.considered_errors), atol=1e-22)  # fmt: skip
+    assert np.abs((error - analysis.mean_error - predicted)[1:] / scale).max() < 0.02
+    assert np.allclose(analysis.covariance - analysis.contributions.sum(axis=1), np.einsum(
+        "mci,mcj->mij", analysis.considered_errors, analysis.considered_errors), atol=1e-22)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -398,10 +402,10 @@ def test_a_considered_error_makes_what_it_makes(name):
 def test_an_error_of_the_scenario_makes_what_it_makes(name, gyro):
     scenario, belief = quiet(still_scenario(**gyro), SIGMA)
     _, error = run_quiet(simulate(scenario), belief, every=60)
-    found = covariance.analyse(scenario, belief, epochs=10)
-    assert name in found.fixed
+    analysis = covariance.analyse(scenario, belief, epochs=10)
+    assert name in analysis.fixed
     scale = np.concatenate([np.full(3, np.abs(error[:, :3]).max()), np.full(3, np.abs(error[:, 3:]).max())])
-    assert np.abs((error - found.mean_error) / scale).max() < 0.02
+    assert np.abs((error - analysis.mean_error) / scale).max() < 0.02
 
 
 def test_coning_shows_as_the_bias_that_the_formula_gives():
@@ -420,15 +424,15 @@ def test_coning_shows_as_the_bias_that_the_formula_gives():
         belief = dataclasses.replace(
             setup.FilterSetup.for_scenario(scenario, states=False), integration=algorithm, bias_sigma=1e-3
         )
-        found = covariance.analyse(scenario, belief, epochs=4)
+        analysis = covariance.analyse(scenario, belief, epochs=4)
         # A hundred cycles: the body is back where it was.
         increments = scenario.motion.increments(np.arange(1001) / rate)
         turned = np.array([1.0, 0.0, 0.0, 0.0])
         for turn in quaternion.exp(coning.rotation_vectors(increments, algorithm)):
             turned = quaternion.multiply(turned, turn)
         drift = quaternion.log(turned)[2] / 10.0
-        assert found.fixed == (f"integration ({name})",)
-        assert found.mean_error[-1, 5] == pytest.approx(-drift, rel=0.005)  # the filter takes the drift for bias
+        assert analysis.fixed == (f"integration ({name})",)
+        assert analysis.mean_error[-1, 5] == pytest.approx(-drift, rel=0.005)  # the filter takes the drift for bias
 
 
 # ------------------------------------------------------------------------------------------------------------- Monte Carlo
@@ -447,25 +451,25 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
         e = consistency.errors(estimate.attitude, estimate.bias, used.truth.attitude[::every], used.truth.bias[::every])
         errors.append(e)
         nees.append(consistency.nees(e, estimate.covariance))
-        for name, one in estimate.innovations.items():
-            nis.setdefault(name, []).append(one.nis.mean() / one.innovation.shape[1])
+        for name, innovations in estimate.innovations.items():
+            nis.setdefault(name, []).append(innovations.nis.mean() / innovations.innovation.shape[1])
     return np.array(errors), np.array(nees), {name: np.array(values) for name, values in nis.items()}
 
 
 def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
-    found = covariance.analyse(scenario, belief, epochs=epochs)
+    analysis = covariance.analyse(scenario, belief, epochs=epochs)
     errors, nees, nis = monte_carlo(scenario, belief, runs, epochs)
     for name, values in nis.items():
         limit = norm.ppf(0.5 + 0.5 * probability ** (1.0 / len(nis))) * values.std() / np.sqrt(runs)
-        assert abs(values.mean() - found.expected_nis[name]) < limit + 0.002, name
-    number = len(found.time) - 1
-    C, mean, P = found.covariance, found.mean_error, found.filter_covariance
+        assert abs(values.mean() - analysis.expected_nis[name]) < limit + 0.002, name
+    number = len(analysis.time) - 1
+    C, mean, P = analysis.covariance, analysis.mean_error, analysis.filter_covariance
     each = 1.0 - (1.0 - probability) / number
     low, high = consistency.mean_bounds(6, runs, each)
     for k in range(1, number + 1):
         away = errors[:, k] - mean[k]
         ratio = consistency.nees(away, np.broadcast_to(C[k], (runs, 6, 6))).mean() / 6.0
-        assert low < ratio < high, f"actual covariance at {found.time[k]} s: {ratio:.3f}, {low:.3f} to {high:.3f}"
+        assert low < ratio < high, f"actual covariance at {analysis.time[k]} s: {ratio:.3f}, {low:.3f} to {high:.3f}"
         average = away.mean(axis=0)
         assert runs * average @ np.linalg.solve(C[k], average) < chi2.ppf(each, 6)
         # NEES with the filter's own P is a quadratic form of a known Gaussian.
@@ -473,8 +477,8 @@ def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
         shift = np.linalg.solve(P[k], mean[k])
         deviation = np.sqrt((2.0 * np.trace(shape @ shape) + 4.0 * shift @ C[k] @ shift) / runs) / 6.0
         limit = norm.ppf(0.5 + 0.5 * each) * deviation
-        assert abs(nees[:, k].mean() / 6.0 - found.expected_nees[k, 0]) < limit
-    return found, errors
+        assert abs(nees[:, k].mean() / 6.0 - analysis.expected_nees[k, 0]) < limit
+    return analysis, errors
 
 
 def test_every_source_together_agrees_with_monte_carlo():
@@ -494,13 +498,13 @@ def test_noise_correlated_between_body_axes_agrees_with_monte_carlo(sigma):
     mag = vectors.Magnetometer(name="mag", field_f=FIELD, sigma=1e-8, rate=1.0, kind="vector", phase=0.31)
     gyro = GyroSpec(angle_random_walk=3e-5, rate_random_walk=1.5e-6)
     scenario = Scenario(motion=TUMBLE, gyro=gyro, sensors=(SLANTED, mag), rate=10.0, duration=60.0)
-    found, _ = check_monte_carlo(scenario, dataclasses.replace(BELIEF, sigma=sigma), runs=150, epochs=4)
+    analysis, _ = check_monte_carlo(scenario, dataclasses.replace(BELIEF, sigma=sigma), runs=150, epochs=4)
     if not sigma:
-        scale = found.filter_sigma[:, :, None] * found.filter_sigma[:, None, :]
-        assert np.abs((found.covariance - found.filter_covariance) / scale).max() < 1e-11
-        assert found.expected_nis == pytest.approx({"tracker": 1.0, "mag": 1.0}, abs=1e-3)
+        scale = analysis.filter_sigma[:, :, None] * analysis.filter_sigma[:, None, :]
+        assert np.abs((analysis.covariance - analysis.filter_covariance) / scale).max() < 1e-11
+        assert analysis.expected_nis == pytest.approx({"tracker": 1.0, "mag": 1.0}, abs=1e-3)
     else:
-        assert found.expected_nees[-1, 1] > 2.0  # the σ about its boresight is 1e-3
+        assert analysis.expected_nees[-1, 1] > 2.0  # the σ about its boresight is 1e-3
 
 
 def of_states(*, many):
@@ -523,10 +527,10 @@ def test_a_filter_with_error_states_agrees_with_monte_carlo(many):
     belief = dataclasses.replace(FilterSetup.for_scenario(scenario), attitude_sigma=2e-3)
     names = ("gyro.drift", "mag.bias", *(("gyro.scale", "sun.correlated") if many else ()))
     assert set(belief.states.names) == set(names)
-    found, _ = check_monte_carlo(scenario, belief, runs=150, epochs=4)
+    analysis, _ = check_monte_carlo(scenario, belief, runs=150, epochs=4)
     plain = covariance.analyse(scenario, dataclasses.replace(belief, states=None), epochs=4)
-    assert found.rms[-1, :3].max() < 0.7 * plain.rms[-1, :3].max()  # what the states are for
-    assert covariance.analyse(scenario, epochs=4).sources == found.sources  # they are the default
+    assert analysis.rms[-1, :3].max() < 0.7 * plain.rms[-1, :3].max()  # what the states are for
+    assert covariance.analyse(scenario, epochs=4).sources == analysis.sources  # they are the default
 
 
 def test_states_without_their_errors_are_a_filter_that_is_too_unsure():
@@ -537,22 +541,22 @@ def test_states_without_their_errors_are_a_filter_that_is_too_unsure():
         scenario,
         gyro=dataclasses.replace(scenario.gyro, markov_noise=0.0),
         sensors=tuple(
-            dataclasses.replace(one, hard_iron=np.zeros(3)) if hasattr(one, "hard_iron") else one
-            for one in scenario.sensors
+            dataclasses.replace(sensor, hard_iron=np.zeros(3)) if hasattr(sensor, "hard_iron") else sensor
+            for sensor in scenario.sensors
         ),
     )
-    found = covariance.analyse(exact, belief, epochs=4)
+    analysis = covariance.analyse(exact, belief, epochs=4)
     record, every = simulate(scenario), 150
     start = setup.initial_state(belief, record.truth.attitude[0], record.truth.bias[0])
     estimate = setup.run(record, belief, start, every=every, full_covariance=True)
     scale = estimate.sigma[:, :, None] * estimate.sigma[:, None, :]
-    assert np.abs((found.filter_covariance - estimate.covariance) / scale).max() < 2e-3  # linear there, and here
-    assert np.all(found.expected_nees[1:, 0] < 0.9)
-    assert found.words.startswith("The filter will be pessimistic")
+    assert np.abs((analysis.filter_covariance - estimate.covariance) / scale).max() < 2e-3  # linear there, and here
+    assert np.all(analysis.expected_nees[1:, 0] < 0.9)
+    assert analysis.words.startswith("The filter will be pessimistic")
     warm = dataclasses.replace(belief, states=dataclasses.replace(belief.states, gyro_temperature_sigma=1e-5))
     without = covariance.analyse(exact, warm, epochs=4)
     assert without.left_out == ("states for the gyro bias over temperature",)
-    np.testing.assert_array_equal(without.filter_covariance, found.filter_covariance)
+    np.testing.assert_array_equal(without.filter_covariance, analysis.filter_covariance)
 
 
 def quarter(belief):
@@ -563,10 +567,10 @@ def quarter(belief):
 
 def test_a_filter_that_models_a_quarter_of_the_process_noise_agrees_too():
     scenario = dataclasses.replace(white("spin", 120.0, scale_factor=np.array([0.0, 0.0, 1e-6])), rate=20.0)
-    found, _ = check_monte_carlo(
+    analysis, _ = check_monte_carlo(
         scenario, quarter(setup.FilterSetup.for_scenario(scenario, states=False)), runs=150, epochs=5
     )
-    assert found.expected_nees[-1, 0] > 1.5  # the mismatch is one to see
+    assert analysis.expected_nees[-1, 0] > 1.5  # the mismatch is one to see
 
 
 @pytest.mark.slow
@@ -601,10 +605,10 @@ def against_the_bound(name, algorithm, *, duration, runs, epochs):
         integration=coning.ALGORITHMS[algorithm],
     )
     bound = covariance.analyse(scenario, belief, epochs=epochs).filter_sigma[1:]
-    found = montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=belief, seed=3, epochs=epochs), runs=runs)
-    assert found.failed == 0
-    square = np.diagonal(found.mean_square_error, axis1=1, axis2=2)[1:] / bound**2
-    return square, found.mean_error[1:] / bound
+    statistics = montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=belief, seed=3, epochs=epochs), runs=runs)
+    assert statistics.failed == 0
+    square = np.diagonal(statistics.mean_square_error, axis1=1, axis2=2)[1:] / bound**2
+    return square, statistics.mean_error[1:] / bound
 
 
 def beyond_the_bound(square, mean, runs):
@@ -657,23 +661,23 @@ def test_initial_errors_may_differ_from_the_filters_model():
     wrong = covariance.analyse(
         scenario, belief, epochs=3, initial_attitude_sigma=2.0 * belief.attitude_sigma, initial_bias_sigma=0.0
     )
-    one, two = right.sources.index("initial attitude"), right.sources.index("initial bias")
-    assert np.allclose(wrong.contributions[:, one], 4.0 * right.contributions[:, one])
-    assert np.all(wrong.contributions[:, two] == 0.0)
+    attitude, bias = right.sources.index("initial attitude"), right.sources.index("initial bias")
+    assert np.allclose(wrong.contributions[:, attitude], 4.0 * right.contributions[:, attitude])
+    assert np.all(wrong.contributions[:, bias] == 0.0)
     assert np.array_equal(wrong.filter_covariance, right.filter_covariance)
 
 
 def test_what_is_left_out_or_beyond_linear_is_reported():
     scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
-    found = covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=2)
-    assert found.left_out == ("gyro rate resolution",)
-    assert any("accelerometer" in one for one in found.beyond_linear)
+    analysis = covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=2)
+    assert analysis.left_out == ("gyro rate resolution",)
+    assert any("accelerometer" in text for text in analysis.beyond_linear)
     wide = covariance.analyse(
         white("spin", 10.0),
         setup.FilterSetup.for_scenario(white("spin", 10.0), attitude_sigma=0.5, states=False),
         epochs=2,
     )
-    assert any("initial attitude" in one for one in wide.beyond_linear)
+    assert any("initial attitude" in text for text in wide.beyond_linear)
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
 
 
@@ -685,7 +689,7 @@ def test_what_is_considered_too_large_is_reported():
         (Consider(mounting={"star": 0.2}), "star mounting, up to"),
         (Consider(time_offset={"star": 5.0}), "star time offset, up to"),
     ):
-        assert any(word in one for one in covariance.analyse(scenario, consider=considered, epochs=2).beyond_linear)
+        assert any(word in text for text in covariance.analyse(scenario, consider=considered, epochs=2).beyond_linear)
     small = Consider(scale_factor=1e-4, misalignment=1e-4, mounting={"star": 1e-4}, time_offset={"star": 1e-4})
     assert covariance.analyse(scenario, consider=small, epochs=2).beyond_linear == ()
 
@@ -696,9 +700,11 @@ def test_an_attitude_error_beyond_linear_is_reported_with_its_time():
     belief = dataclasses.replace(
         setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3, states=False), bias_sigma=1e-2
     )
-    found = covariance.analyse(scenario, belief, epochs=4)
-    assert found.beyond_linear == (f"the attitude error itself, {found.rms[-1, :3].max() / DEGREE:.3g}° at 100 s",)
-    assert found.rms[-1, 0] == pytest.approx(1.0, rel=0.01)
+    analysis = covariance.analyse(scenario, belief, epochs=4)
+    assert analysis.beyond_linear == (
+        f"the attitude error itself, {analysis.rms[-1, :3].max() / DEGREE:.3g}° at 100 s",
+    )
+    assert analysis.rms[-1, 0] == pytest.approx(1.0, rel=0.01)
     short = covariance.analyse(dataclasses.replace(scenario, duration=10.0), belief, epochs=4)
     assert short.beyond_linear == ()
 
@@ -755,11 +761,11 @@ def test_axes_of_a_gyro_may_differ():
 
 def test_the_initial_bias_contains_the_part_too_fast_for_a_state():
     scenario = of_states(many=False)
-    chosen = FilterSetup.for_scenario(scenario)
-    states = dataclasses.replace(chosen.states, gyro_fast_bias_sigma=0.5 * chosen.bias_sigma)
-    chosen = dataclasses.replace(chosen, states=states)
-    found = covariance.analyse(scenario, chosen, epochs=2)
-    np.testing.assert_allclose(found.filter_sigma[0, 3:], chosen.bias_sigma, rtol=1e-9)
+    belief = FilterSetup.for_scenario(scenario)
+    states = dataclasses.replace(belief.states, gyro_fast_bias_sigma=0.5 * belief.bias_sigma)
+    belief = dataclasses.replace(belief, states=states)
+    analysis = covariance.analyse(scenario, belief, epochs=2)
+    np.testing.assert_allclose(analysis.filter_sigma[0, 3:], belief.bias_sigma, rtol=1e-9)
 
 
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
@@ -768,17 +774,17 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     assert "The filter has no state for the gyro's scale factor" in said
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
-    found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
-    assert len(found["time_s"]) == 11
+    saved = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
+    assert len(saved["time_s"]) == 11
     direct = covariance.analyse(
         load_scenario("spin"),
         setup.FilterSetup.for_scenario(load_scenario("spin"), states=False),
         consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}),
         epochs=10,
     )
-    assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
-    assert np.allclose(np.array(found["rms"]["bias_deg_per_hour"]) * DEGREE / 3600.0, direct.rms[:, 3:])
-    assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
+    assert np.allclose(np.array(saved["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
+    assert np.allclose(np.array(saved["rms"]["bias_deg_per_hour"]) * DEGREE / 3600.0, direct.rms[:, 3:])
+    assert np.allclose(saved["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
     assert f"optimistic in bias: √NEES is {np.sqrt(direct.expected_nees[-1, 2]):.3g}." in " ".join(said.split())
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
@@ -820,10 +826,11 @@ def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch,
     (tmp_path / "filter.toml").write_text(setup.to_toml(BELIEF), encoding="utf-8")
 
     def reached(scenario, *considered):
-        arguments = ["covariance", scenario, "--filter", "filter.toml", *(f"--consider={one}" for one in considered)]
-        found = CliRunner().invoke(cli.app, arguments)
-        assert isinstance(found.exception, Reached), found.output
-        return found.exception.args
+        options = [f"--consider={error}" for error in considered]
+        arguments = ["covariance", scenario, "--filter", "filter.toml", *options]
+        result = CliRunner().invoke(cli.app, arguments)
+        assert isinstance(result.exception, Reached), result.output
+        return result.exception.args
 
     errors = ("scale_factor=3", "misalignment=2", "g_sensitivity=7", "star.bias=4", "star.mounting=5", "star.delay=6")
     belief, consider, _ = reached("spin", *errors)
@@ -843,9 +850,9 @@ def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch,
 def test_a_scenario_without_sensors_is_dead_reckoning():
     spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-7)
     scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=100.0)
-    found = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
+    analysis = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
         angle_random_walk=1e-4, rate_random_walk=1e-7)), epochs=1)  # fmt: skip
     t = 100.0
     expected = 2e-3**2 + (2e-5 * t) ** 2 + 1e-8 * t + 1e-14 * t**3 / 3.0
-    assert np.allclose(np.diag(found.covariance[-1])[:3], expected, rtol=1e-9)
-    assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
+    assert np.allclose(np.diag(analysis.covariance[-1])[:3], expected, rtol=1e-9)
+    assert analysis.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)

@@ -91,7 +91,7 @@ WHOLE = scenario(None, {"kind": "vector"})
 def sensed(change: Callable[[vectors.VectorMeasurements], vectors.VectorMeasurements], *sensors: str) -> Any:
     """What changes the series of these sensors."""
     return lambda record: replace(
-        record, vectors=tuple(change(one) if one.sensor in sensors else one for one in record.vectors)
+        record, vectors=tuple(change(series) if series.sensor in sensors else series for series in record.vectors)
     )
 
 
@@ -133,7 +133,7 @@ CASES = (
     Case("wrong convention", "gyro", change=turning(lambda turns: 57.3 * turns)),
     Case("wrong convention", "magnetometer", change=read_as(lambda v: v[:, [1, 0, 2]], "magnetometer")),
 )
-each_case = pytest.mark.parametrize("case", CASES, ids=lambda one: f"{one.name} of {one.of}")
+each_case = pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.name} of {case.of}")
 
 
 NOTHING = Case("", "")
@@ -148,18 +148,18 @@ def diagnosed(case: Case, seed: int) -> diagnosis.Diagnosis:
     return diagnosis.diagnose(record, case.setup, initial)
 
 
-def named(found: diagnosis.Diagnosis) -> tuple[str, str] | None:
-    return (found.causes[0].name, found.causes[0].of) if found.causes else None
+def named(explanation: diagnosis.Diagnosis) -> tuple[str, str] | None:
+    return (explanation.causes[0].name, explanation.causes[0].of) if explanation.causes else None
 
 
 @each_case
 def test_the_first_cause_is_the_one(case):
-    found = diagnosed(case, 0)
-    assert named(found) == (case.name, case.of)
+    explanation = diagnosed(case, 0)
+    assert named(explanation) == (case.name, case.of)
     if case.near:
-        assert found.causes[0].estimate == pytest.approx(case.estimate, abs=case.near)
-    assert found.judgement.verdict == "not consistent"
-    assert found.words.startswith("not consistent")
+        assert explanation.causes[0].estimate == pytest.approx(case.estimate, abs=case.near)
+    assert explanation.judgement.verdict == "not consistent"
+    assert explanation.words.startswith("not consistent")
 
 
 @pytest.mark.slow
@@ -195,9 +195,9 @@ ORBITAL = setup.FilterSetup(
 def test_the_noise_of_a_gyro_is_not_taken_for_a_scale_factor():
     """To scale the increments is to scale their noise too, and a filter with less noise has smaller innovations."""
     record = scenarios.simulate(SLOW_TURN, seed=0)
-    found = diagnosis.diagnose(record, ORBITAL, start(record, ORBITAL, 0, 0))
-    assert named(found) is None
-    (scale,) = (cause for cause in found.considered if cause.name == "scale factor")
+    explanation = diagnosis.diagnose(record, ORBITAL, start(record, ORBITAL, 0, 0))
+    assert named(explanation) is None
+    (scale,) = (cause for cause in explanation.considered if cause.name == "scale factor")
     assert np.all(np.abs(scale.estimate) < 3.0 * scale.standard_error)
     assert scale.gain < 6.0
 
@@ -236,10 +236,10 @@ def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
 @pytest.mark.parametrize("truth", [True, False], ids=["with truth", "without"])
 def test_commutation_is_named_with_the_rate_that_it_implies(algorithm, truth):
     predicted = coning.predicted_coning_drift(coning.ALGORITHMS[algorithm], 0.7 * units.DEGREE, 10.0, 0.01)
-    found = cone(algorithm, 0, truth)
-    assert named(found) == ("commutation", algorithm)
-    assert found.causes[0].estimate == pytest.approx([0.0, 0.0, predicted], abs=0.06 * abs(predicted))
-    assert "°/h" in found.words
+    explanation = cone(algorithm, 0, truth)
+    assert named(explanation) == ("commutation", algorithm)
+    assert explanation.causes[0].estimate == pytest.approx([0.0, 0.0, predicted], abs=0.06 * abs(predicted))
+    assert "°/h" in explanation.words
 
 
 def test_an_algorithm_that_serves_is_given_no_cause():
@@ -280,14 +280,14 @@ def test_log_p_goes_on_where_the_function_underflows(degrees):
 
 
 def test_the_summary_is_plain():
-    found = diagnosed(LATE, 0)
-    saved = json.loads(json.dumps(found.summary(), allow_nan=False))
+    explanation = diagnosed(LATE, 0)
+    saved = json.loads(json.dumps(explanation.summary(), allow_nan=False))
     assert saved["causes"][0]["name"] == "time offset"
     assert saved["causes"][0]["significant"]
     assert saved["causes"][0]["unit"] == "s"
-    assert "too late" in found.words
-    assert len(found.considered) > len(found.causes)
-    assert found.judgement.verdict == "not consistent"
+    assert "too late" in explanation.words
+    assert len(explanation.considered) > len(explanation.causes)
+    assert explanation.judgement.verdict == "not consistent"
 
 
 def test_a_record_without_measurements_is_refused():
@@ -303,8 +303,8 @@ def test_missing_and_outlying_measurements_do_not_disturb():
     holes = first.vector_b.copy()
     holes[::7] = np.nan
     record = records.cut(replace(record, vectors=(replace(first, vector_b=holes), second)), 0, 2990)
-    found = diagnosis.diagnose(record, RIGHT, start(record, RIGHT, 5, 0))
-    assert named(found) == ("time offset", "star")
+    explanation = diagnosis.diagnose(record, RIGHT, start(record, RIGHT, 5, 0))
+    assert named(explanation) == ("time offset", "star")
 
 
 def test_outliers_are_counted_and_sized():
@@ -315,17 +315,17 @@ def test_outliers_are_counted_and_sized():
     assert outliers("star", white).gain < 9.0
     struck = random.random(4000) < 0.03
     white[struck] *= 10.0
-    found = outliers("star", white)
-    assert found.estimate == pytest.approx([0.03, 10.0], rel=0.15)
-    assert found.gain > 1000.0
+    cause = outliers("star", white)
+    assert cause.estimate == pytest.approx([0.03, 10.0], rel=0.15)
+    assert cause.gain > 1000.0
     # What is larger as a whole is no outliers of a part: these are of three times the noise at least.
     assert outliers("star", 1.2 * random.standard_normal((4000, 2))).estimate[1] >= 3.0
 
 
 def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     """Two axes swapped: the grossest faults: many causes explain them, several of the same name and sensor."""
-    made = scenario()
-    record = scenarios.simulate(made, seed=1)
+    specification = scenario()
+    record = scenarios.simulate(specification, seed=1)
     record = replace(record, increments=record.increments[:, [1, 0, 2]])
     recordfiles.write_record(tmp_path / "record.h5", record)
     assert run("estimate", "record.h5", "--from-truth", "--out", "out")[::2] == (0, "")
@@ -335,10 +335,10 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
     assert causes[0]["name"] == "wrong convention"
     assert causes[0]["significant"]
-    found, reason = sd.diagnose(sd.read("out/estimate.h5"), sd.read("record.h5"))
+    explanation, reason = sd.diagnose(sd.read("out/estimate.h5"), sd.read("record.h5"))
     assert reason == ""
     saved = json.loads((tmp_path / "check.json").read_text())["diagnosis"]
-    assert saved == {**json.loads(json.dumps(found.summary())), "without_a_state": []}
+    assert saved == {**json.loads(json.dumps(explanation.summary())), "without_a_state": []}
 
 
 # ------------------------------------------------------------------------------------------------------------- one of these causes
@@ -361,14 +361,14 @@ def test_of_two_directions_it_is_undecided_whose_reference_is_off():
     """Two directions show the angle between their references alone: turn one or the other."""
     off = quaternion.exp(np.array([2e-3, 0.0, 0.0]))
     turned = sensed(lambda s: replace(s, reference_f=quaternion.rotate(off, s.reference_f)), "star")
-    found = diagnosed(Case("", "", change=turned), 0)
-    assert {(cause.name, cause.of) for cause in found.alternatives} >= {
+    explanation = diagnosed(Case("", "", change=turned), 0)
+    assert {(cause.name, cause.of) for cause in explanation.alternatives} >= {
         ("reference direction", "star"),
         ("reference direction", "magnetometer"),
     }
-    assert "One of these causes, which the data do not distinguish:" in found.words
+    assert "One of these causes, which the data do not distinguish:" in explanation.words
     alternatives = {
-        row["of"]: row["alternative"] for row in found.summary()["causes"] if row["name"] == "reference direction"
+        row["of"]: row["alternative"] for row in explanation.summary()["causes"] if row["name"] == "reference direction"
     }
     assert alternatives == {"star": True, "magnetometer": True}
 
@@ -382,9 +382,9 @@ def test_of_three_directions_the_one_is_named():
         for name, reference in names.items()
     )
     turned = sensed(lambda s: replace(s, reference_f=quaternion.rotate(quaternion.exp(theta), s.reference_f)), "star")
-    found = diagnosed(Case("", "", replace(scenario(), sensors=sensors), change=turned), 0)
-    assert [(cause.name, cause.of) for cause in found.alternatives] == [("reference direction", "star")]
-    assert found.causes[0].estimate == pytest.approx(theta, abs=6e-5)
+    explanation = diagnosed(Case("", "", replace(scenario(), sensors=sensors), change=turned), 0)
+    assert [(cause.name, cause.of) for cause in explanation.alternatives] == [("reference direction", "star")]
+    assert explanation.causes[0].estimate == pytest.approx(theta, abs=6e-5)
 
 
 def test_of_one_sensor_it_is_undecided_whether_it_or_the_gyro_is_turned():
@@ -392,18 +392,21 @@ def test_of_one_sensor_it_is_undecided_whether_it_or_the_gyro_is_turned():
     alone = replace(whole, sensors=whole.sensors[1:])
     turn = quaternion.to_matrix(quaternion.exp(-np.array([8e-3, 6e-3, -7e-3])))
     for change in (turning(lambda turns: turns @ turn.T), read_as(lambda v: v @ turn.T, "star")):
-        found = diagnosed(Case("", "", alone, change=change), 0)
-        assert {(cause.name, cause.of) for cause in found.alternatives} >= {("mounting", "gyro"), ("mounting", "star")}
+        explanation = diagnosed(Case("", "", alone, change=change), 0)
+        assert {(cause.name, cause.of) for cause in explanation.alternatives} >= {
+            ("mounting", "gyro"),
+            ("mounting", "star"),
+        }
 
 
 # -------------------------------------------------------------------------------------------------------------------- one verdict
 
 
-def written(folder: Path, made: scenarios.Scenario, chosen: setup.FilterSetup, seed: int) -> None:
+def written(folder: Path, specification: scenarios.Scenario, filter_setup: setup.FilterSetup, seed: int) -> None:
     """A record without its truth, and a filter, as files."""
-    record = replace(scenarios.simulate(made, seed=seed), truth=None)
+    record = replace(scenarios.simulate(specification, seed=seed), truth=None)
     recordfiles.write_record(folder / "record.h5", record)
-    (folder / "filter.toml").write_text(setup.to_toml(chosen))
+    (folder / "filter.toml").write_text(setup.to_toml(filter_setup))
 
 
 def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
@@ -424,14 +427,14 @@ def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
 
 def test_evidence_is_taken_together_at_one_rate_of_false_alarms():
     """Holm's procedure by hand: of 20 statistics and causes together the least p-value must be below 0.01/20."""
-    found = diagnosed(NOTHING, 3)
-    every = found.judgement.findings
-    assert len(every) > len(found.considered) > 10
+    explanation = diagnosed(NOTHING, 3)
+    every = explanation.judgement.findings
+    assert len(every) > len(explanation.considered) > 10
     assert not any(finding.rejected for finding in every)
     least = min(every, key=lambda finding: finding.p_value)
     assert least.p_value > 0.01 / len(every)
     for p, verdict in ((0.009 / len(every), "not consistent"), (0.011 / len(every), "cannot tell")):
-        changed = [replace(one, p_value=p) if one is least else one for one in every]
+        changed = [replace(finding, p_value=p) if finding is least else finding for finding in every]
         assert consistency.concluded(changed, (), 0.99, parts={}).verdict == verdict
 
 

@@ -42,10 +42,10 @@ def shell_lines(page: Path) -> list[str]:
 def commands(page: Path) -> list[list[str]]:
     """Return each call of the program on a page as its words, also of those in the running text."""
     text = page.read_text(encoding="utf-8")
-    lines = [f"strapdown {one}" for one in re.findall(r"`strapdown ([^`\n]+)`", without_output(text))]
+    lines = [f"strapdown {call}" for call in re.findall(r"`strapdown ([^`\n]+)`", without_output(text))]
     lines += re.findall(r"^\| (`strapdown [^|]*`) \|", text, re.MULTILINE)
     calls = []
-    for line in [*shell_lines(page), *(part for one in lines for part in one.replace("`", "").split(", "))]:
+    for line in [*shell_lines(page), *(part for entry in lines for part in entry.replace("`", "").split(", "))]:
         for part in re.split(r"&&|\|\||[;|](?![^']*'\s)", re.sub(r"(^|\s)#.*", "", line)):
             try:
                 words = shlex.split(part)
@@ -75,8 +75,8 @@ def unknown(words: list[str]) -> str:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_and_option_exists(page):
-    found = commands(page)
-    assert [problem for words in found if (problem := unknown(words))] == []
+    calls = commands(page)
+    assert [problem for words in calls if (problem := unknown(words))] == []
 
 
 def test_the_reference_of_the_command_line_has_every_command_and_option():
@@ -142,7 +142,7 @@ def test_every_page_is_in_a_table_of_contents():
                 rows = [row.strip() for row in body.splitlines() if row.strip() and not row.startswith(":")]
                 for row in rows:
                     listed |= {
-                        str(one.relative_to(DOCS).with_suffix("")) for one in (page.parent).glob(f"{row}.md")
+                        str(file.relative_to(DOCS).with_suffix("")) for file in (page.parent).glob(f"{row}.md")
                     } or pytest.fail(f"{page.name} lists {row}, which is not there")
     pages = {str(page.relative_to(DOCS).with_suffix("")) for page in PAGES if DOCS in page.parents}
     assert pages - listed == set()
@@ -189,7 +189,7 @@ def test_the_comparison_shows_what_the_theory_says():
     assert all(ratio > 0.95 for ratio in ratios.values())
     judged = json.loads((DOCS / "_data/peer_judged.json").read_text(encoding="utf-8"))
     assert judged["runs"] == 200
-    verdicts = {name: one["verdict"] for name, one in judged["cases"].items()}
+    verdicts = {name: case["verdict"] for name, case in judged["cases"].items()}
     assert verdicts["GTSAM"] == verdicts["AttiPy, heading's derivative mended"] == "consistent"
     wrong = ("smsfusion", "AttiPy", "smsfusion, noises of another sensor", "GTSAM, gyro with a bias")
     assert {verdicts[name] for name in wrong} == {"not consistent"}
@@ -198,7 +198,7 @@ def test_the_comparison_shows_what_the_theory_says():
 def test_tests_that_pages_name_exist():
     """Each formula of the mathematics names the test that checks it."""
     named = {
-        found for page in PAGES for found in re.findall(r"(test_\w+\.py)::(test_\w+)", page.read_text(encoding="utf-8"))
+        test for page in PAGES for test in re.findall(r"(test_\w+\.py)::(test_\w+)", page.read_text(encoding="utf-8"))
     }
     assert len(named) > 10
     for file, name in sorted(named):

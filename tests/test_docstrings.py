@@ -120,8 +120,8 @@ def _faults(name: str) -> list[str]:
     """Return what is missing in the documentation of one name."""
     checks = {"GL08", "SS01", "SS03", "SS06"} if _in_protocol(name) else CHECKS
     parsed = functools.cache(_Reference)
-    found = validate(name, parsed)
-    faults = [f"{code} {message}" for code, message in found["errors"] if code in checks]
+    validation = validate(name, parsed)
+    faults = [f"{code} {message}" for code, message in validation["errors"] if code in checks]
     if "GL08" not in " ".join(faults):
         for parameter, (kind, text) in parsed(obj_name=name).doc_all_parameters.items():
             unit = UNITS.get(parameter)

@@ -33,9 +33,9 @@ def dataclasses_of_the_package() -> Iterator[type]:
     for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):
         content = vars(importlib.import_module(module.name))
         yield from (
-            one
-            for one in content.values()
-            if isinstance(one, type) and dataclasses.is_dataclass(one) and one.__module__ == module.name
+            value
+            for value in content.values()
+            if isinstance(value, type) and dataclasses.is_dataclass(value) and value.__module__ == module.name
         )
 
 
@@ -45,10 +45,10 @@ def dummy(hint: Any, above: tuple[type, ...] = ()) -> Any:  # noqa: PLR0911
     if origin is np.ndarray or hint is Any:
         return np.arange(3.0)
     if origin in (types.UnionType, typing.Union):
-        made = [dummy(one, above) for one in arguments if one is not type(None)]
-        return next((one for one in made if isinstance(one, np.ndarray | dict | list)), made[0])
+        dummies = [dummy(argument, above) for argument in arguments if argument is not type(None)]
+        return next((value for value in dummies if isinstance(value, np.ndarray | dict | list)), dummies[0])
     if origin is tuple:
-        return tuple(dummy(one, above) for one in arguments if one is not Ellipsis)
+        return tuple(dummy(argument, above) for argument in arguments if argument is not Ellipsis)
     if origin in (dict, collections.abc.Mapping):
         return {"key": dummy(arguments[1], above)}
     if origin is collections.abc.Sequence:  # all make a tuple of it
@@ -62,23 +62,23 @@ def dummy(hint: Any, above: tuple[type, ...] = ()) -> Any:  # noqa: PLR0911
 
 def filled(kind: type, above: tuple[type, ...] = ()) -> Any:
     """An instance whose fields hold values of their types, unchecked."""
-    made = object.__new__(kind)
+    instance = object.__new__(kind)
     hints = typing.get_type_hints(kind, localns=FOR_CHECKERS)
     for field in dataclasses.fields(kind):
-        object.__setattr__(made, field.name, dummy(hints[field.name], (*above, kind)))
-    return made
+        object.__setattr__(instance, field.name, dummy(hints[field.name], (*above, kind)))
+    return instance
 
 
 def test_any_two_can_be_compared_and_hashed():
     for kind in dataclasses_of_the_package():
-        one, other = filled(kind), filled(kind)
-        assert one in (one,), kind
-        equal = one == other
+        instance, other = filled(kind), filled(kind)
+        assert instance in (instance,), kind
+        equal = instance == other
         assert isinstance(equal, bool), kind
-        assert (one in (other,)) is equal, kind
+        assert (instance in (other,)) is equal, kind
         if kind.__dataclass_params__.frozen:
-            assert hash(one) == hash(one), kind
-            assert not equal or hash(one) == hash(other), kind
+            assert hash(instance) == hash(instance), kind
+            assert not equal or hash(instance) == hash(other), kind
 
 
 def test_specifications_are_compared_by_value():
@@ -103,10 +103,10 @@ def test_specifications_are_compared_by_value():
     assert scenario() != scenario(2e-3)
     assert len({scenario(), scenario(), scenario(2e-3)}) == 2
     noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=0.0)
-    chosen = setup.FilterSetup(process_noise=noise, bias_sigma=1e-3, sigma={"star": (1e-3, 1e-3, 2e-3)})
-    assert chosen == dataclasses.replace(chosen)
-    assert hash(chosen) == hash(dataclasses.replace(chosen))
-    assert chosen != dataclasses.replace(chosen, sigma={"star": 1e-3})
+    filter_setup = setup.FilterSetup(process_noise=noise, bias_sigma=1e-3, sigma={"star": (1e-3, 1e-3, 2e-3)})
+    assert filter_setup == dataclasses.replace(filter_setup)
+    assert hash(filter_setup) == hash(dataclasses.replace(filter_setup))
+    assert filter_setup != dataclasses.replace(filter_setup, sigma={"star": 1e-3})
 
 
 def test_methods_are_equal_if_function_and_object_are():
@@ -132,6 +132,6 @@ def test_results_are_compared_by_identity():
             words="",
         )
 
-    one, other = cause(), cause()
-    assert one in (other, one)
-    assert one not in (other,)
+    first, other = cause(), cause()
+    assert first in (other, first)
+    assert first not in (other,)

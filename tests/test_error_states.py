@@ -266,7 +266,7 @@ SENSORS = {
 
 
 def effects_of(blocks: tuple[error_states.ErrorStates, ...], values: np.ndarray) -> dict:
-    found: dict = {}
+    effects: dict = {}
     first = 0
     for block in blocks:
         own = values[first : first + block.size]
@@ -276,8 +276,8 @@ def effects_of(blocks: tuple[error_states.ErrorStates, ...], values: np.ndarray)
                 rows = getattr(effect, name)
                 if rows is not None:
                     key = (sensor, "carried" if name == "offset_f" and effect.carried else name)
-                    found[key] = found.get(key, 0.0) + np.tensordot(own, rows, axes=1)
-    return found
+                    effects[key] = effects.get(key, 0.0) + np.tensordot(own, rows, axes=1)
+    return effects
 
 
 @pytest.mark.parametrize("transverse", [False, True])
@@ -424,9 +424,9 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
     for name in ("attitude", "bias", "variance", "covariance"):
         joined = np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
         assert np.array_equal(joined, getattr(whole, name)), name
-    for sensor, one in whole.innovations.items():
+    for sensor, innovations in whole.innovations.items():
         joined = np.concatenate([part.innovations[sensor].innovation for part in parts])
-        assert np.array_equal(joined, one.innovation), sensor
+        assert np.array_equal(joined, innovations.innovation), sensor
 
 
 @pytest.mark.parametrize("gate", [None, pytest.param(Gate(), marks=pytest.mark.slow)], ids=["plain", "gate"])
@@ -522,8 +522,8 @@ def reference_smoother(record, initial, blocks):
     "option",
     [
         *(
-            pytest.param(one, marks=pytest.mark.slow)
-            for one in ("gyro drift", "two frames", "mounting of whole attitudes")
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("gyro drift", "two frames", "mounting of whole attitudes")
         ),
         "all",
     ],
@@ -533,14 +533,14 @@ def test_the_smoother_is_the_textbook_one(option):
     # A wrong start, so that corrections are tenths of a radian and a missing Jacobian shows.
     initial = start(error=(0.2, -0.1, 0.15))
     initial = dataclasses.replace(initial, covariance=np.diag([0.04] * 3 + [1e-5] * 3))
-    one = estimation.smooth(record, NOISE, initial, blocks, full_covariance=True)
+    estimate = estimation.smooth(record, NOISE, initial, blocks, full_covariance=True)
     q, b, c, P = reference_smoother(record, initial, blocks)
-    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
+    sigma = np.sqrt(np.einsum("kii->ki", estimate.whole_covariance))
     values = dict(
-        zip(one.error_states, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True)
+        zip(estimate.error_states, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True)
     )
-    assert np.max(np.abs(one.errors(q, b, values)) / sigma) < 1e-8
-    assert np.max(np.abs(correlation(one.whole_covariance - P, sigma))) < 1e-8
+    assert np.max(np.abs(estimate.errors(q, b, values)) / sigma) < 1e-8
+    assert np.max(np.abs(correlation(estimate.whole_covariance - P, sigma))) < 1e-8
 
 
 def test_the_rows_that_are_kept_do_not_change_the_filter():
@@ -601,11 +601,11 @@ def test_a_gyro_scale_needs_a_turn_about_each_axis():
         ("about z", motion.HarmonicRates(harmonics=(motion.Harmonic(amplitude=(0.0, 0.0, 1.5), frequency=0.2),))),
         ("about all", HAND),
     ):
-        found = estimation.observability(plain_record(body), NOISE, initial, blocks)
-        ranks[name] = found.rank
+        observability = estimation.observability(plain_record(body), NOISE, initial, blocks)
+        ranks[name] = observability.rank
         if name == "about z":
-            seen_states = np.flatnonzero(found.unobserved < 0.5)
-            names = [found.states[k] for k in seen_states]
+            seen_states = np.flatnonzero(observability.unobserved < 0.5)
+            names = [observability.states[k] for k in seen_states]
             assert names[6:] == ["gyro scale xz", "gyro scale yz", "gyro scale z"]
     assert ranks == {"still": 6, "about z": 9, "about all": 15}
 
@@ -621,14 +621,14 @@ def test_singular_values_are_those_of_the_stacked_rows(off):
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
     blocks = (error_states.VectorBias(sensor="star", bias_sigma=0.05),)
     initial = dataclasses.replace(estimation.with_error_states(initial, blocks), values=bias)
-    found = estimation.observability(record, NOISE, initial, blocks)
+    observability = estimation.observability(record, NOISE, initial, blocks)
     # Across z, the measured (x, y) is (−δθ_y + c_x, δθ_x + c_y).
     rows = np.zeros((2, 9))
     rows[0, 1], rows[0, 6], rows[1, 0], rows[1, 7] = -0.1, 0.05, 0.2, 0.05
     expected = np.linalg.svd(rows / 0.01, compute_uv=False)
-    np.testing.assert_allclose(found.singular_values[:2], expected, rtol=1e-9)
-    np.testing.assert_allclose(found.singular_values[2:], 0.0, atol=1e-6)
-    assert found.rank == 2
+    np.testing.assert_allclose(observability.singular_values[:2], expected, rtol=1e-9)
+    np.testing.assert_allclose(observability.singular_values[2:], 0.0, atol=1e-6)
+    assert observability.rank == 2
 
 
 def test_a_heading_shows_the_tilt_by_the_dip_that_was_measured():
@@ -636,8 +636,10 @@ def test_a_heading_shows_the_tilt_by_the_dip_that_was_measured():
     compass = series_of("compass", "heading", [0.0], [[0.6, 0.0, 0.8]], [1.0, 0.0, 0.0], 0.01)
     record = resting(compass)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
-    found = estimation.observability(record, NOISE, initial)
-    np.testing.assert_allclose(found.singular_values[:2], [np.hypot(0.3, 0.2 / 0.75) / 0.01, 0.0], rtol=1e-9, atol=1e-6)
+    observability = estimation.observability(record, NOISE, initial)
+    np.testing.assert_allclose(
+        observability.singular_values[:2], [np.hypot(0.3, 0.2 / 0.75) / 0.01, 0.0], rtol=1e-9, atol=1e-6
+    )
 
 
 def test_what_is_left_along_each_direction_is_reported_in_the_units_of_the_states():
@@ -647,31 +649,35 @@ def test_what_is_left_along_each_direction_is_reported_in_the_units_of_the_state
     correlated[0, 1] = correlated[1, 0] = 0.6 * np.sqrt(correlated[0, 0] * correlated[1, 1])
     initial = dataclasses.replace(start(), covariance=correlated)
     record = plain_record(motion.rest())
-    found = estimation.observability(record, NOISE, initial, blocks)
+    observability = estimation.observability(record, NOISE, initial, blocks)
     where = estimation.smooth(record, NOISE, initial, blocks)
     begin = dataclasses.replace(initial, attitude=where.attitude[0], bias=np.zeros(3))
     exact = without_errors(record, where.attitude)
     whole = estimation.smooth(exact, NOISE, begin, blocks, full_covariance=True)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.left.T @ found.left)), found.start_sigma, rtol=1e-6)
-    apart = np.outer(found.start_sigma, found.start_sigma)
-    np.testing.assert_allclose(found.left.T @ found.left / apart, whole.whole_covariance[0] / apart, atol=1e-6)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(observability.left.T @ observability.left)), observability.start_sigma, rtol=1e-6
+    )
+    apart = np.outer(observability.start_sigma, observability.start_sigma)
+    np.testing.assert_allclose(
+        observability.left.T @ observability.left / apart, whole.whole_covariance[0] / apart, atol=1e-6
+    )
     prior = initial.covariance
-    sizes = [one[:6] @ np.linalg.solve(prior, one[:6]) + np.sum((one[6:] / 1e-5) ** 2) for one in found.left]
-    np.testing.assert_allclose(sizes, 1.0 / (1.0 + found.singular_values**2), rtol=1e-6)
-    weakest = found.words(-1)
-    assert f"attitude z ({abs(found.left[-1, 2]):.2g} rad)" in weakest
-    assert found.words(8) in str(found)
-    written = json.loads(json.dumps(found.summary()))
-    assert written["rank"] == found.rank
-    assert [one["unit"] for one in written["states"]] == ["rad"] * 3 + ["rad/s"] * 3 + ["T"] * 3
-    assert written["directions"][-1]["one_sigma_left"]["mag bias x"] == found.left[-1, 6]
-    assert written["directions"][0]["singular_value"] == found.singular_values[0]
+    sizes = [row[:6] @ np.linalg.solve(prior, row[:6]) + np.sum((row[6:] / 1e-5) ** 2) for row in observability.left]
+    np.testing.assert_allclose(sizes, 1.0 / (1.0 + observability.singular_values**2), rtol=1e-6)
+    weakest = observability.words(-1)
+    assert f"attitude z ({abs(observability.left[-1, 2]):.2g} rad)" in weakest
+    assert observability.words(8) in str(observability)
+    written = json.loads(json.dumps(observability.summary()))
+    assert written["rank"] == observability.rank
+    assert [state["unit"] for state in written["states"]] == ["rad"] * 3 + ["rad/s"] * 3 + ["T"] * 3
+    assert written["directions"][-1]["one_sigma_left"]["mag bias x"] == observability.left[-1, 6]
+    assert written["directions"][0]["singular_value"] == observability.singular_values[0]
 
 
 def test_observability_takes_every_kind_of_measurement():
-    found = estimation.observability(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"])
-    assert len(found.states) == len(found.units) == len(found.singular_values) == 24
-    assert np.all(found.start_sigma <= found.prior_sigma * (1.0 + 1e-9))
+    observability = estimation.observability(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"])
+    assert len(observability.states) == len(observability.units) == len(observability.singular_values) == 24
+    assert np.all(observability.start_sigma <= observability.prior_sigma * (1.0 + 1e-9))
 
 
 # ----------------------------------------------------------------------------------------------------------------------- bad input
@@ -679,7 +685,7 @@ def test_observability_takes_every_kind_of_measurement():
 
 def _laid_out_otherwise(record):
     """Return the same record with times that may be written to and come with gaps, and one σ for all measurements of a sensor."""
-    series = (dataclasses.replace(one, sigma=float(one.sigma[0])) for one in record.vectors)
+    series = (dataclasses.replace(measurements, sigma=float(measurements.sigma[0])) for measurements in record.vectors)
     return dataclasses.replace(record, time=np.repeat(record.time, 2)[::2], vectors=tuple(series))
 
 
@@ -745,15 +751,16 @@ def test_the_covariance_stays_positive_definite(sharpness):
 def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
     """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
     turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
-    seen = VectorMeasurements(
+    series = VectorMeasurements(
         sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
     )
-    record = resting(seen)
+    record = resting(series)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
-    found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
+    estimate = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
     correction = wide**2 / (wide**2 + sigma**2) * turn
-    assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
-    assert abs(np.linalg.norm(found.attitude[0]) - 1.0) < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
+    assert quaternion.angle_between(estimate.attitude[0], quaternion.exp(correction)) < 1e-7
+    length_error = abs(np.linalg.norm(estimate.attitude[0]) - 1.0)
+    assert length_error < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
     J = kinematics.right_jacobian(correction)
     P = J @ J.T / (wide**-2.0 + sigma**-2.0)
-    np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(estimate.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

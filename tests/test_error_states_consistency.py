@@ -51,10 +51,10 @@ class Run:
 def mounted(record: ImuRecord, theta: np.ndarray) -> ImuRecord:
     """Return the record with the magnetometer's axes turned by theta, rad, exactly."""
     turned = [
-        dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.exp(-theta), one.vector_b))
-        if one.sensor == "mag"
-        else one
-        for one in record.vectors
+        dataclasses.replace(series, vector_b=quaternion.rotate(quaternion.exp(-theta), series.vector_b))
+        if series.sensor == "mag"
+        else series
+        for series in record.vectors
     ]
     return dataclasses.replace(record, vectors=tuple(turned))
 
@@ -126,19 +126,19 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
     """
     epochs = None
     values = []
-    for one in runs(case, number, duration, seed):
+    for run in runs(case, number, duration, seed):
         face = estimation.smooth if smoothed else estimation.run
-        estimate = face(one.record, one.noise, one.initial, blocks, full_covariance=True)
+        estimate = face(run.record, run.noise, run.initial, blocks, full_covariance=True)
         if epochs is None:
             epochs = np.linspace(0.4, 0.95, 5) * (len(estimate.time) - 1)
             epochs = epochs.astype(int)
-        true_bias = one.record.truth.bias
+        true_bias = run.record.truth.bias
         if case == "gyro drift":
-            true_bias = true_bias - one.truth[DRIFT.name]
-        truth = {block.name: one.truth[block.name] for block in blocks if block is not SWAY}
+            true_bias = true_bias - run.truth[DRIFT.name]
+        truth = {block.name: run.truth[block.name] for block in blocks if block is not SWAY}
         if any(block is SWAY or block.name == SWAY.name for block in blocks):
             truth[SWAY.name] = np.zeros(3)
-        error = estimate.errors(one.record.truth.attitude, true_bias, truth)[epochs]
+        error = estimate.errors(run.record.truth.attitude, true_bias, truth)[epochs]
         P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         names = state_names(blocks)[0]
         kept = [k for k, name in enumerate(names) if not name.startswith(SWAY.name)]
@@ -155,9 +155,9 @@ def quick_or_slow(cases, quick=("gyro scale", "hard iron", "acceleration", "gyro
 @pytest.mark.parametrize(
     ("case", "smoothed"),
     [
-        pytest.param(*one.values, smoothed, marks=one.marks)
+        pytest.param(*param.values, smoothed, marks=param.marks)
         for cases, smoothed in ((CASES, False), (("gyro scale", "mounting", "gyro drift", "all"), True))
-        for one in quick_or_slow(cases)
+        for param in quick_or_slow(cases)
     ],
 )
 def test_the_covariance_is_consistent(case, smoothed):
@@ -208,16 +208,16 @@ def test_it_is_not_with_the_block_broken(how):
 @pytest.mark.parametrize("case", quick_or_slow(["gyro scale", "hard iron", "soft iron", "mounting", "all"]))
 def test_calibration_is_found(case):
     """After a while of turning, what the simulated sensors have is found to a fraction of what was known before."""
-    one = simulated(case, 21, 0, 60.0)
-    estimate = estimation.run(one.record, one.noise, one.initial, CASES[case])
+    run = simulated(case, 21, 0, 60.0)
+    estimate = estimation.run(run.record, run.noise, run.initial, CASES[case])
     for block in CASES[case]:
         if block is SWAY:
             continue
-        found = estimate.error_states[block.name]
-        error = one.truth[block.name] - found.values[-1]
-        assert np.all(np.abs(error) < 4.0 * found.sigma[-1])
-        assert np.all(found.sigma[-1] < 0.25 * block.sigma)
-        assert np.linalg.norm(error) < 0.25 * np.linalg.norm(one.truth[block.name])
+        state = estimate.error_states[block.name]
+        error = run.truth[block.name] - state.values[-1]
+        assert np.all(np.abs(error) < 4.0 * state.sigma[-1])
+        assert np.all(state.sigma[-1] < 0.25 * block.sigma)
+        assert np.linalg.norm(error) < 0.25 * np.linalg.norm(run.truth[block.name])
 
 
 def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
@@ -242,11 +242,11 @@ def test_an_acceleration_is_followed():
     record, sway, block = swaying(5, 0.5, 0.8)
     initial = estimation.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-3)
     noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
-    found = estimation.run(record, noise, initial, (block,), every=2).error_states["acc disturbance"]
-    error = sway - found.values[1:]
+    disturbance = estimation.run(record, noise, initial, (block,), every=2).error_states["acc disturbance"]
+    error = sway - disturbance.values[1:]
     late = slice(200, None)
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.2
-    assert 0.7 < np.mean((error[late] / found.sigma[1:][late]) ** 2) < 1.4
+    assert 0.7 < np.mean((error[late] / disturbance.sigma[1:][late]) ** 2) < 1.4
 
 
 @pytest.mark.parametrize("initial_sigma", [8e-3, np.array([1e-3, 4e-3, 3e-2])])

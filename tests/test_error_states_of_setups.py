@@ -92,7 +92,7 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
     ) == setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
 
 
-def chosen(states, **more) -> FilterSetup:
+def setup_of(states, **more) -> FilterSetup:
     return FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=3e-3, states=states, **more)
 
 
@@ -107,17 +107,20 @@ def test_a_gate_keeps_outliers_from_the_states():
     record = simulated(outlier_probability=0.05, duration=60.0)
     states = States(sensors={"mag": SensorStates(bias_sigma=3e-6)})
     plain, gated, robust = (
-        run(record, chosen(states, **options)) for options in ({}, {"gate": Gate(recovery=None)}, {"robust": Robust()})
+        run(record, setup_of(states, **options))
+        for options in ({}, {"gate": Gate(recovery=None)}, {"robust": Robust()})
     )
     true = np.array([2e-6, -3e-6, 1e-6])
-    errors = [np.linalg.norm(one.error_states["mag bias"].values[-1] - true) for one in (plain, gated, robust)]
+    errors = [
+        np.linalg.norm(estimate.error_states["mag bias"].values[-1] - true) for estimate in (plain, gated, robust)
+    ]
     struck = len(record.vectors[0].time) * 0.05
     assert 0.5 * struck < gated.refused["mag"] < 1.6 * struck
     assert gated.refused["acc"] < 10
-    for one, error in ((gated, errors[1]), (robust, errors[2])):
+    for estimate, error in ((gated, errors[1]), (robust, errors[2])):
         assert error < errors[0]
-        assert error < 4.0 * np.linalg.norm(one.error_states["mag bias"].sigma[-1])
-        used = one.innovations["mag"]
+        assert error < 4.0 * np.linalg.norm(estimate.error_states["mag bias"].sigma[-1])
+        used = estimate.innovations["mag"]
         nis = used.nis[used.weight > 0.5].mean() / 3.0
         assert 0.85 < nis < 1.1
     assert plain.innovations["mag"].nis.mean() / 3.0 > 3.0
@@ -126,7 +129,7 @@ def test_a_gate_keeps_outliers_from_the_states():
 def test_the_gate_of_a_vector_lets_pass_as_many_as_it_says():
     record = simulated(duration=120.0, seed=8)
     states = States(sensors={"mag": SensorStates(bias_sigma=3e-6)})
-    estimate = run(record, chosen(states, gate=Gate(probability=0.9, recovery=None)))
+    estimate = run(record, setup_of(states, gate=Gate(probability=0.9, recovery=None)))
     for innovations in estimate.innovations.values():
         assert abs(innovations.refused / len(innovations.time) - 0.1) < 4.0 * np.sqrt(0.09 / len(innovations.time))
 
@@ -140,7 +143,7 @@ def test_the_whole_bias_is_that_of_all_states():
         gyro_scale_sigma=1e-3, gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4
     )
     initial = begun(record)
-    reported = setup.run(record, chosen(states), initial, every=50, full_covariance=True)
+    reported = setup.run(record, setup_of(states), initial, every=50, full_covariance=True)
     blocks = states.blocks({"mag": "vector", "acc": "vector"})
     begin = setup.running.state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
     whole = estimation.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
@@ -154,7 +157,7 @@ def test_the_whole_bias_is_that_of_all_states():
     np.testing.assert_allclose(reported.variance, np.einsum("kii->ki", expected), rtol=1e-11)
     np.testing.assert_allclose(
         reported.bias,
-        whole.bias + sum(one.values for name, one in whole.error_states.items() if "drift" in name),
+        whole.bias + sum(state.values for name, state in whole.error_states.items() if "drift" in name),
         rtol=0,
         atol=1e-15,
     )
@@ -170,15 +173,15 @@ def test_the_smoother_reports_the_whole_bias_too():
     """At the last edge it is the filter; there the kernels sum the parts."""
     record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
     states = States(gyro_drift_sigma=(2e-3,), gyro_drift_time=(8.0,), gyro_fast_bias_sigma=1e-4)
-    given = chosen(states)
-    filtered = run(record, given, full_covariance=True)
-    smoothed = setup.smooth(record, given, begun(record), full_covariance=True)
+    filter_setup = setup_of(states)
+    filtered = run(record, filter_setup, full_covariance=True)
+    smoothed = setup.smooth(record, filter_setup, begun(record), full_covariance=True)
     np.testing.assert_allclose(smoothed.bias[-1], filtered.bias[-1], rtol=1e-9)
     np.testing.assert_allclose(smoothed.covariance[-1], filtered.covariance[-1], rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(smoothed.variance, np.einsum("kii->ki", smoothed.covariance), rtol=1e-12)
     middle = len(record.time) // 2
     assert np.all(smoothed.variance[middle] < filtered.variance[middle])
-    diagonals = setup.smooth(record, given, begun(record))
+    diagonals = setup.smooth(record, filter_setup, begun(record))
     assert diagonals.covariance is None
     assert diagonals.whole_covariance is None
     np.testing.assert_array_equal(diagonals.variance, smoothed.variance)
@@ -247,9 +250,9 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion(body, white):
     edges, time = 0.005 * np.arange(20001), np.arange(1.0, 99.0, 0.0413)
     noise = np.random.default_rng(1).standard_normal((20000, 3))
     record = ImuRecord(time=edges, increments=body.increments(edges) + white * np.sqrt(0.005) * noise)
-    found, variance = angular_acceleration.turning(record, time)
-    assert np.max(np.abs(found[:, :3] - body.body_rate(time))) < 6.0 * white / np.sqrt(0.005) + 1e-4
-    assert 0.85 < np.mean((found[:, 3:] - body.body_angular_acceleration(time)) ** 2 / variance) < 1.08
+    turning, variance = angular_acceleration.turning(record, time)
+    assert np.max(np.abs(turning[:, :3] - body.body_rate(time))) < 6.0 * white / np.sqrt(0.005) + 1e-4
+    assert 0.85 < np.mean((turning[:, 3:] - body.body_angular_acceleration(time)) ** 2 / variance) < 1.08
 
 
 def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
@@ -260,9 +263,9 @@ def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
     C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
     measured = structure.Measured((), (), (), length, (0.0,) * 6 + tuple(variance))
     kernels = forward.instance_of(model)
-    found = kernels.arm_noise(0, x, measured, tuple(C[upper]), model.numbers, 0.0)
+    noise = kernels.arm_noise(0, x, measured, tuple(C[upper]), model.numbers, 0.0)
     r = kinematics.skew(arm / length)
-    np.testing.assert_allclose(found, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
+    np.testing.assert_allclose(noise, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["vector", "direction"])
@@ -341,7 +344,7 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
         ),
     )
     right, wrong = (setup.run(record, which, begun(record, 0.01, 1e-3)) for which in (filter_setup, firm))
-    nis = [one.innovations["magnetometer"].nis[300:].mean() / 2.0 for one in (right, wrong)]
+    nis = [estimate.innovations["magnetometer"].nis[300:].mean() / 2.0 for estimate in (right, wrong)]
     assert abs(nis[0] - 1.0) < 0.08
     assert nis[1] > 1.3
     error = right.error_states["magnetometer bias"].values[-1] / np.sqrt(np.mean(field**-2.0)) - iron
@@ -358,8 +361,8 @@ def test_a_direction_that_its_states_make_longer_has_the_less_noise():
     )
     for along in (0.0, 1.0, 3.0):
         state = dataclasses.replace(start, values=np.array([along, 0.0, 0.0]))
-        found = estimation.run(record, NOISE, state, (strong,)).innovations["a"]
-        np.testing.assert_allclose(found.variance, 1e-6 / (1.0 + along) ** 2, rtol=1e-6)
+        innovations = estimation.run(record, NOISE, state, (strong,)).innovations["a"]
+        np.testing.assert_allclose(innovations.variance, 1e-6 / (1.0 + along) ** 2, rtol=1e-6)
 
 
 def test_the_strength_of_a_heading_s_field_leaves_its_level_part_out():
@@ -397,19 +400,19 @@ def test_the_drifts_that_measurements_follow_are_states_and_the_rest_is_white():
 
 def test_what_a_specification_gives_is_matched_entry_by_entry():
     scenario = scenarios.load_scenario("spin")
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
-    assert chosen.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
-    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario, states=False).process_noise
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+    assert filter_setup.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
+    assert filter_setup.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
+    assert filter_setup.process_noise == setup.FilterSetup.for_scenario(scenario, states=False).process_noise
     markov = GyroSpec(angle_random_walk=1e-5, markov_noise=1e-6, markov_correlation_time=50.0)
-    found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, gyro=markov), states=True)
-    assert found.states.gyro_drift_time == (50.0,)
-    assert found.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
-    assert found.process_noise.rate_random_walk == 0.0
+    changed = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, gyro=markov), states=True)
+    assert changed.states.gyro_drift_time == (50.0,)
+    assert changed.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
+    assert changed.process_noise.rate_random_walk == 0.0
     field, iron = np.array([2e-5, 0.0, -4e-5]), np.array([1e-6, 2e-6, 3e-6])
     compass = vectors.Magnetometer(name="compass", field_f=field, sigma=1e-7, rate=1.0, kind="heading", hard_iron=iron)
-    found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, sensors=(compass,)), states=True)
-    assert found.states.sensors["compass"].bias_sigma == pytest.approx(tuple(iron / np.linalg.norm(field)))
+    changed = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, sensors=(compass,)), states=True)
+    assert changed.states.sensors["compass"].bias_sigma == pytest.approx(tuple(iron / np.linalg.norm(field)))
     falling = setup.FilterSetup.for_scenario(scenarios.load_scenario("tumbling-satellite"), states=True)
     assert "gyro.force" not in falling.states.names
 
@@ -425,9 +428,9 @@ def test_a_motion_that_commutes_badly_gets_a_better_integration():
 def test_individuals_are_drawn_with_the_reported_errors_for_sigma():
     scenario = scenarios.load_scenario("low-orbit")
     drawn = [scenarios.drawn(scenario, 7, k) for k in range(300)]
-    irons = np.array([one.sensors[1].hard_iron for one in drawn])
+    irons = np.array([individual.sensors[1].hard_iron for individual in drawn])
     np.testing.assert_allclose(np.std(irons, axis=0), np.abs(scenario.sensors[1].hard_iron), rtol=0.15)
-    matrices = np.array([one.gyro.misalignment for one in drawn])
+    matrices = np.array([individual.gyro.misalignment for individual in drawn])
     assert np.all(np.diagonal(matrices, axis1=1, axis2=2) == 0.0)
     np.testing.assert_allclose(np.std(matrices, axis=0), scenario.gyro.misalignment, rtol=0.2)
     again = scenarios.drawn(scenario, 7, 0)
@@ -446,12 +449,14 @@ def test_chosen_states_are_those_named():
 
 def test_the_acceleration_of_a_vibration_is_not_reported_too_small():
     """Noise has a window of 37 samples taken, of which 0.9 % of a vibration of 8 Hz is lost: a lever arm would make up for it."""
-    chosen = scenarios.load_scenario("hand-held")
+    scenario = scenarios.load_scenario("hand-held")
     gains = []
     for seed in range(3):
-        record = scenarios.simulate(chosen, seed)
+        record = scenarios.simulate(scenario, seed)
         time = record.vectors[0].time
-        exact = np.concatenate([chosen.motion.body_rate(time), chosen.motion.body_angular_acceleration(time)], axis=1)
-        found, _ = angular_acceleration.turning(record, time)
-        gains.append(np.sum(found * exact, axis=0) / np.sum(exact**2, axis=0))
+        exact = np.concatenate(
+            [scenario.motion.body_rate(time), scenario.motion.body_angular_acceleration(time)], axis=1
+        )
+        turning, _ = angular_acceleration.turning(record, time)
+        gains.append(np.sum(turning * exact, axis=0) / np.sum(exact**2, axis=0))
     np.testing.assert_allclose(np.mean(gains, axis=0), 1.0, rtol=0.0, atol=1e-3)

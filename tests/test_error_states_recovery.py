@@ -61,7 +61,7 @@ QUICK = ("hard iron", "chains")
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
+class Trial:
     """A record, what a right filter starts from, and the truth of the blocks."""
 
     record: ImuRecord
@@ -69,9 +69,9 @@ class Made:
     truth: dict
 
 
-def made(
+def simulated(
     case: str, run: int, duration: float = 12.0, rate: float = 10.0, magnet: float = 0.0, states: float = 1.0
-) -> Made:
+) -> Trial:
     """Draw the truth of the states from their prior, and what sensors make of it, each at times of its own.
 
     ``magnet``: so long, in s, the hard iron is off by 3.3 standard deviations. ``states`` is the share of the states that there is.
@@ -93,7 +93,7 @@ def made(
     known = Truth(attitude=q, bias=np.broadcast_to(bias, (len(edges), 3)).copy())
     record = ImuRecord(time=edges, increments=turn, vectors=series, truth=known)
     initial = drawn_start(known, rng.standard_normal(6), ATTITUDE_SIGMA, BIAS_SIGMA)
-    return Made(record=record, initial=initial, truth=truth)
+    return Trial(record=record, initial=initial, truth=truth)
 
 
 def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
@@ -142,40 +142,40 @@ def lost(state: estimation.State, run: int) -> estimation.State:
     return dataclasses.replace(state, attitude=quaternion.multiply(state.attitude, quaternion.exp(turn)))
 
 
-def without_gyro(given: Made, begin: float, end: float) -> Made:
+def without_gyro(trial: Trial, begin: float, end: float) -> Trial:
     """The gyro, and all else, is out for a while, in which the body turns on: over the gap no turn is measured."""
-    record = given.record
+    record = trial.record
     i, j = np.searchsorted(record.time, [begin - 1e-9, end - 1e-9])
     kept = np.r_[0 : i + 1, j : len(record.time)]
     increments = np.concatenate([record.increments[:i], np.zeros((1, 3)), record.increments[j:]])
     series = tuple(s.taken(np.flatnonzero((s.time < begin) | (s.time > end))) for s in record.vectors)
     truth = Truth(attitude=record.truth.attitude[kept], bias=record.truth.bias[kept])
     cut = ImuRecord(time=record.time[kept], increments=increments, vectors=series, truth=truth)
-    return dataclasses.replace(given, record=cut)
+    return dataclasses.replace(trial, record=cut)
 
 
-def judged(case: str, runs: int, make: Callable[[int], Made], after, since: float = 0.0, bias_sigma: float = 1e-5):
+def judged(case: str, runs: int, make: Callable[[int], Trial], after, since: float = 0.0, bias_sigma: float = 1e-5):
     """Return of each run the recoveries, and ANEES of attitude, bias and blocks at times after the first that ends after ``since``.
 
     ``bias_sigma`` is how far the bias has jumped. There is no truth of an acceleration, and it is left out.
     """
     gate = Gate(restart_bias_sigma=bias_sigma)
     blocks = CASES[case][1]
-    recovered, found = [], []
+    recovered, nees = [], []
     for run in range(runs):
-        one = make(run)
-        estimate = estimation.run(one.record, NOISE, one.initial, blocks, gate=gate, full_covariance=True)
+        trial = make(run)
+        estimate = estimation.run(trial.record, NOISE, trial.initial, blocks, gate=gate, full_covariance=True)
         recovered.append([event for event in recoveries(estimate) if event.end > since])
         if not recovered[-1]:
             continue
-        values = {block.name: np.zeros(3) if block is SWAY else one.truth[block.name] for block in blocks}
-        error = estimate.errors(one.record.truth.attitude, one.record.truth.bias, values)
+        values = {block.name: np.zeros(3) if block is SWAY else trial.truth[block.name] for block in blocks}
+        error = estimate.errors(trial.record.truth.attitude, trial.record.truth.bias, values)
         last = 6 + sum(block.size for block in blocks if block is not SWAY)  # which comes last
         rows = np.searchsorted(estimate.time, recovered[-1][0].end + np.asarray(after) - 1e-9)
         parts = slice(0, 3), slice(3, 6), slice(6, last)
         P = estimate.whole_covariance
-        found.append([[consistency.nees(error[k, s], P[k][s, s]) / len(error[k, s]) for s in parts] for k in rows])
-    return recovered, np.mean(found, axis=0)
+        nees.append([[consistency.nees(error[k, s], P[k][s, s]) / len(error[k, s]) for s in parts] for k in rows])
+    return recovered, np.mean(nees, axis=0)
 
 
 def assert_consistent(case: str, mean, runs: int) -> None:
@@ -198,8 +198,8 @@ RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
 @pytest.mark.parametrize("case", quick_or_slow(CASES))
 def test_a_lost_start_is_recovered_from_and_all_states_are_consistent(case, runs):
     def make(run):
-        one = made(case, run)
-        return dataclasses.replace(one, initial=lost(one.initial, run))
+        trial = simulated(case, run)
+        return dataclasses.replace(trial, initial=lost(trial.initial, run))
 
     recovered, mean = judged(case, runs, make, (0.1, 1.0, 3.0, 8.0))
     for events in recovered:
@@ -217,7 +217,7 @@ def test_a_lost_start_is_recovered_from_and_all_states_are_consistent(case, runs
 def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
     """20 s of calibration, then 2 s without a gyro: the attitude is off by up to half a turn, and all else is as it was."""
     recovered, mean = judged(
-        case, runs, lambda run: without_gyro(made(case, run, 35.0), 20.0, 22.0), (0.1, 1.0, 3.0, 11.0), since=20.0
+        case, runs, lambda run: without_gyro(simulated(case, run, 35.0), 20.0, 22.0), (0.1, 1.0, 3.0, 11.0), since=20.0
     )
     for events in recovered:
         (event,) = events
@@ -230,7 +230,7 @@ def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
 def test_a_state_that_was_led_astray_recovers_too(runs):
     """A magnet is carried for 15 s and learnt as hard iron; taken away, that is off by 3.3 σ of the prior, and by 50 of its own."""
     recovered, mean = judged(
-        "hard iron", runs, lambda run: made("hard iron", run, 27.0, magnet=15.0), (0.1, 1.0, 3.0, 10.0), since=15.0
+        "hard iron", runs, lambda run: simulated("hard iron", run, 27.0, magnet=15.0), (0.1, 1.0, 3.0, 10.0), since=15.0
     )
     for events in recovered:
         (event,) = events
@@ -244,13 +244,13 @@ def test_a_step_of_the_bias_is_recovered_from(runs):
     """By 17 °/s (1 σ) on each axis after 12 s: the attitude is off when it shows, and the states, which it has drawn along, start anew."""
 
     def make(run):
-        one = made("hard iron", run, 24.0)
+        trial = simulated("hard iron", run, 24.0)
         step = 0.3 * generator(8, run, "step").standard_normal(3)
-        record = one.record
+        record = trial.record
         later = (record.time[1:] > 12.0)[:, None]
         truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias + (record.time >= 12.0)[:, None] * step)
         stepped = dataclasses.replace(record, increments=record.increments + 0.02 * later * step, truth=truth)
-        return dataclasses.replace(one, record=stepped)
+        return dataclasses.replace(trial, record=stepped)
 
     recovered, mean = judged("hard iron", runs, make, (0.1, 1.0, 3.0, 9.0), since=12.0, bias_sigma=0.3)
     assert all(len(events) == 1 and events[0].start < 13.2 for events in recovered)
@@ -263,7 +263,7 @@ def test_by_default_a_candidate_doubts_the_bias_as_at_the_start():
     P = np.diag([1.0, 1.0, 1.0, 1e-4, 2e-4, 3e-4, 5.0])
     first = State(attitude=quaternion.IDENTITY, bias=np.zeros(3), values=np.zeros(1), covariance=P)
     assert np.array_equal(restart_bias_variance(gate, first), [1e-4, 2e-4, 3e-4])
-    gap = lambda run: without_gyro(made("hard iron", run, 32.0), 20.0, 22.0)  # noqa: E731
+    gap = lambda run: without_gyro(simulated("hard iron", run, 32.0), 20.0, 22.0)  # noqa: E731
     _, mean = judged("hard iron", 20, gap, (0.1, 9.0), 20.0, BIAS_SIGMA)
     high = consistency.mean_bounds(3, 20, 0.9999)[1]
     assert mean[0, 1] < 0.5
@@ -271,8 +271,8 @@ def test_by_default_a_candidate_doubts_the_bias_as_at_the_start():
 
 
 def test_without_recovery_it_stays_lost():
-    one = made("hard iron", 1)
-    estimate = estimation.run(one.record, NOISE, lost(one.initial, 1), (IRON,), gate=Gate(recovery=None))
+    trial = simulated("hard iron", 1)
+    estimate = estimation.run(trial.record, NOISE, lost(trial.initial, 1), (IRON,), gate=Gate(recovery=None))
     assert not recoveries(estimate)
     by_sensor = {event.sensor: event for event in estimate.events}
     assert set(by_sensor) == {"mag", "acc"}
@@ -280,7 +280,7 @@ def test_without_recovery_it_stays_lost():
         assert event.kind == "lock-out"
         assert event.start < 0.2
         assert event.value == pytest.approx(estimate.refused[sensor], abs=3)
-    assert quaternion.angle_between(estimate.attitude[-1], one.record.truth.attitude[-1]) > 0.5
+    assert quaternion.angle_between(estimate.attitude[-1], trial.record.truth.attitude[-1]) > 0.5
     assert estimate.refused["mag"] > 100
 
 
@@ -289,16 +289,16 @@ def test_a_right_filter_never_starts_anew(runs):
     """A tenth of the measurements 30 times as noisy: each starts a candidate, and none takes over."""
     refused = total = 0
     for run in range(runs):
-        one = made("hard iron", run, duration=30.0)
+        trial = simulated("hard iron", run, duration=30.0)
         series = []
-        for k, s in enumerate(one.record.vectors):
+        for k, s in enumerate(trial.record.vectors):
             rng = generator(7, run, f"outliers {k}")
             struck = rng.random(len(s.time)) < 0.1
             off = 30.0 * s.sigma[:, None] * rng.standard_normal((len(s.time), 3))
             series.append(dataclasses.replace(s, vector_b=s.vector_b + struck[:, None] * off))
             total += int(np.sum(struck))
-        record = dataclasses.replace(one.record, vectors=tuple(series))
-        estimate = estimation.run(record, NOISE, one.initial, (IRON,), gate=Gate())
+        record = dataclasses.replace(trial.record, vectors=tuple(series))
+        estimate = estimation.run(record, NOISE, trial.initial, (IRON,), gate=Gate())
         assert not estimate.events
         refused += sum(estimate.refused.values())
     assert 0.9 < refused / total < 1.1
@@ -309,17 +309,17 @@ def test_a_right_filter_never_starts_anew(runs):
 
 def test_a_start_that_is_surer_than_its_blocks_is_not_accepted_by_a_candidate():
     """A start that goes on from an earlier part: its values are kept, and what it knows of them is what the block says at least."""
-    one = made("hard iron", 2)
-    begun = estimation.with_error_states(one.initial, (IRON,))
+    trial = simulated("hard iron", 2)
+    begun = estimation.with_error_states(trial.initial, (IRON,))
     P = begun.covariance.copy()
     P[6:, 6:] = np.diag([1e-8, 1e-8, 3e-6]) ** 2
     P[6, 7] = P[7, 6] = 5e-17
-    values, found = forward.restart_states(
+    values, covariance = forward.restart_states(
         dataclasses.replace(begun, values=np.array([1e-6, 2e-6, 3e-6]), covariance=P), (IRON,)
     )
     assert np.array_equal(values, [1e-6, 2e-6, 3e-6])
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), [1e-6, 1e-6, 3e-6])
-    assert found[0, 1] == 5e-17
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [1e-6, 1e-6, 3e-6])
+    assert covariance[0, 1] == 5e-17
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -346,11 +346,11 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
         field = seen(q, FIELD) + 1e-6 * p[3:]
         return np.concatenate([(mag - field) / 3e-7, (acc - seen(q, UP)) / 0.05, p[3:]])
 
-    found = least_squares(residuals, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    best = quaternion.multiply(true, quaternion.exp(found.x[:3]))
-    P = np.linalg.inv(found.jac.T @ found.jac)
+    solution = least_squares(residuals, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    best = quaternion.multiply(true, quaternion.exp(solution.x[:3]))
+    P = np.linalg.inv(solution.jac.T @ solution.jac)
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), best))
-    error = np.concatenate([turn, found.x[3:] - 1e6 * face.values])
+    error = np.concatenate([turn, solution.x[3:] - 1e6 * face.values])
     assert np.max(np.abs(error) / np.sqrt(np.diag(P))) < 0.3
     kept, unit_of = [0, 1, 2, 6, 7, 8], np.array([1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
     mine = face.P[np.ix_(kept, kept)] / np.outer(unit_of, unit_of)
@@ -361,9 +361,9 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
 # ------------------------------------------------------------------------------------------------------------------------- the faces
 
 
-def assert_same_events(one, other):
-    assert len(one.events) == len(other.events)
-    for a, b in zip(one.events, other.events, strict=True):
+def assert_same_events(estimate, other):
+    assert len(estimate.events) == len(other.events)
+    for a, b in zip(estimate.events, other.events, strict=True):
         assert (a.kind, a.sensor) == (b.kind, b.sensor)
         assert (a.start, a.end, a.value) == pytest.approx((b.start, b.end, b.value))
 
@@ -372,21 +372,21 @@ def assert_same_events(one, other):
 @pytest.mark.parametrize("at", [(7,), (20, 21), range(1, 150)], ids=len)
 def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
     """Cut before, within and after the time that a candidate runs: its state, all counts and the prior of states that change go on."""
-    one = made("hard iron", 3, duration=3.0)
-    given = {"gate": Gate(recovery=5), "full_covariance": True}
-    start = lost(one.initial, 3)
+    trial = simulated("hard iron", 3, duration=3.0)
+    options = {"gate": Gate(recovery=5), "full_covariance": True}
+    start = lost(trial.initial, 3)
     if gap:
-        one, start = without_gyro(made("hard iron", 3, duration=4.0), 1.5, 2.5), one.initial
-    whole, end = estimation.run_part(one.record, NOISE, start, (WALKING, HELD), **given)
+        trial, start = without_gyro(simulated("hard iron", 3, duration=4.0), 1.5, 2.5), trial.initial
+    whole, end = estimation.run_part(trial.record, NOISE, start, (WALKING, HELD), **options)
     (recovered,) = recoveries(whole)
-    state, found, events = start, [], []
-    for first, last in itertools.pairwise((0, *at, len(one.record.increments))):
-        part = records.cut(one.record, first, last)
-        estimate, state = estimation.run_part(part, NOISE, state, (WALKING, HELD), **given)
-        found.append(estimate.attitude[0 if first == 0 else 1 :])
+    state, attitudes, events = start, [], []
+    for first, last in itertools.pairwise((0, *at, len(trial.record.increments))):
+        part = records.cut(trial.record, first, last)
+        estimate, state = estimation.run_part(part, NOISE, state, (WALKING, HELD), **options)
+        attitudes.append(estimate.attitude[0 if first == 0 else 1 :])
         events += recoveries(estimate)
     assert events == [recovered]
-    assert np.array_equal(np.concatenate(found), whole.attitude)
+    assert np.array_equal(np.concatenate(attitudes), whole.attitude)
     assert np.array_equal(state.covariance, end.covariance)
     assert np.array_equal(state.values, end.values)
 
@@ -402,15 +402,15 @@ FACES = {**CASES, "hard iron that walks": (("mag", "acc"), (WALKING,)), "chains"
 
 @pytest.mark.parametrize("case", quick_or_slow(FACES))
 def test_both_faces_recover_alike(case):
-    one = made(case if case in CASES else "hard iron", 3, duration=1.6)
-    assert_recover_alike(one.record, lost(one.initial, 3), FACES[case][1], Robust())
+    trial = simulated(case if case in CASES else "hard iron", 3, duration=1.6)
+    assert_recover_alike(trial.record, lost(trial.initial, 3), FACES[case][1], Robust())
 
 
 def test_both_faces_recover_alike_from_what_the_prior_says_by_then():
     """The gyro fails for a second: restart candidates start two seconds after the prior, which has grown meanwhile."""
-    one = without_gyro(made("hard iron", 3, duration=4.0), 1.5, 2.5)
+    trial = without_gyro(simulated("hard iron", 3, duration=4.0), 1.5, 2.5)
     quick = dataclasses.replace(WALKING, rate_random_walk=1e-6)
-    assert_recover_alike(one.record, one.initial, (quick, HELD), None)
+    assert_recover_alike(trial.record, trial.initial, (quick, HELD), None)
 
 
 def assert_recover_alike(record, start, blocks, robust):
@@ -429,11 +429,11 @@ def assert_recover_alike(record, start, blocks, robust):
 @pytest.mark.parametrize("case", ["hard iron", "chains"])
 def test_both_faces_widen_a_candidate_alike(case):
     """The bias is off by thirty times what the gate allows it to have changed."""
-    one = made("hard iron", 3, duration=2.0)
-    start = dataclasses.replace(lost(one.initial, 3), bias=one.initial.bias + np.array([0.3, -0.2, 0.25]))
+    trial = simulated("hard iron", 3, duration=2.0)
+    start = dataclasses.replace(lost(trial.initial, 3), bias=trial.initial.bias + np.array([0.3, -0.2, 0.25]))
     gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), FACES[case][1]
-    whole, end = estimation.run_part(one.record, NOISE, start, blocks, gate=gate, full_covariance=True)
-    step = in_steps.run(one.record, NOISE, start, blocks, gate=gate)
+    whole, end = estimation.run_part(trial.record, NOISE, start, blocks, gate=gate, full_covariance=True)
+    step = in_steps.run(trial.record, NOISE, start, blocks, gate=gate)
     assert end.gate.counts[gate_rules.LEVEL] > 1.0
     assert recoveries(whole)
     assert_same_events(whole, step)
@@ -446,7 +446,7 @@ def test_both_faces_widen_a_candidate_alike(case):
 @pytest.mark.slow
 def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_path):
     """Drifts beside the bias, and hard iron; the setup from its file. Events are in order of time, those of gaps among them."""
-    one = without_gyro(made("hard iron", 4, duration=20.0), 8.0, 8.5)
+    trial = without_gyro(simulated("hard iron", 4, duration=20.0), 8.0, 8.5)
     states = States(gyro_drift_sigma=(1e-4,), gyro_drift_time=(5.0,), sensors={"mag": SensorStates(bias_sigma=1e-6)})
     filter_setup = FilterSetup(
         process_noise=NOISE, attitude_sigma=ATTITUDE_SIGMA, bias_sigma=BIAS_SIGMA, states=states, gate=Gate(recovery=7)
@@ -454,15 +454,15 @@ def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_
     path = tmp_path / "filter.toml"
     path.write_text(setup.to_toml(filter_setup), encoding="utf-8")
     assert "recovery = 7" in path.read_text(encoding="utf-8")
-    estimate = setup.run(one.record, setup.read_setup(path), lost(one.initial, 4), full_covariance=True)
+    estimate = setup.run(trial.record, setup.read_setup(path), lost(trial.initial, 4), full_covariance=True)
     first = recoveries(estimate)[0]
     assert first.end < 1.0
     assert first.value >= 7
     assert [event.start for event in estimate.events] == sorted(event.start for event in estimate.events)
     assert {"gap", "recovery"} == {event.kind for event in estimate.events}
-    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
+    assert np.all(np.abs(errors(estimate, trial.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
     iron = estimate.error_states["mag bias"]
-    assert np.all(np.abs(iron.values[-1] - one.truth[IRON.name]) < 4.5 * iron.sigma[-1])
+    assert np.all(np.abs(iron.values[-1] - trial.truth[IRON.name]) < 4.5 * iron.sigma[-1])
 
 
 def test_a_campaign_of_lost_starts_with_states_ends_consistent():
@@ -498,11 +498,11 @@ def test_a_campaign_of_lost_starts_with_states_ends_consistent():
 
 @pytest.mark.slow
 def test_a_lever_arm_recovers():
-    one = made("hard iron", 5, duration=6.0)
+    trial = simulated("hard iron", 5, duration=6.0)
     states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})
     filter_setup = FilterSetup(process_noise=NOISE, bias_sigma=BIAS_SIGMA, states=states, gate=Gate())
-    estimate = setup.run(one.record, filter_setup, lost(one.initial, 5), full_covariance=True)
+    estimate = setup.run(trial.record, filter_setup, lost(trial.initial, 5), full_covariance=True)
     assert len(recoveries(estimate)) == 1
-    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
+    assert np.all(np.abs(errors(estimate, trial.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
     arm = estimate.error_states["acc lever arm"]
     assert np.all(np.abs(arm.values[-1]) < 4.5 * arm.sigma[-1])

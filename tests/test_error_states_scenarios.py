@@ -54,35 +54,35 @@ class Study:
         )
 
 
-def studied(scenario, chosen, runs, *, seed=100, individuals=True) -> Study:
+def studied(scenario, filter_setup, runs, *, seed=100, individuals=True) -> Study:
     """Run the filter on so many individuals of a scenario, or on the scenario itself; errors at five epochs of its last four fifths."""
-    found = Study(nees={subset: [] for subset in consistency.SUBSETS}, nis={})
+    study = Study(nees={subset: [] for subset in consistency.SUBSETS}, nis={})
     for run in range(runs):
-        one = scenarios.drawn(scenario, seed, run) if individuals else scenario
-        record = scenarios.simulate(one, seed, run)
-        initial = start(record, chosen, seed, run)
-        every = len(record.increments) // chosen.integration.samples // 20
-        estimate = setup.run(record, chosen, initial, every=every, full_covariance=True)
-        truth = setup.modelled_record(record, chosen).truth
+        individual = scenarios.drawn(scenario, seed, run) if individuals else scenario
+        record = scenarios.simulate(individual, seed, run)
+        initial = start(record, filter_setup, seed, run)
+        every = len(record.increments) // filter_setup.integration.samples // 20
+        estimate = setup.run(record, filter_setup, initial, every=every, full_covariance=True)
+        truth = setup.modelled_record(record, filter_setup).truth
         epochs = np.linspace(4, len(estimate.time) - 1, 5).astype(int)
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
         for subset, states in consistency.SUBSETS.items():
-            found.nees[subset].append(consistency.nees(error[epochs], estimate.covariance[epochs], states))
+            study.nees[subset].append(consistency.nees(error[epochs], estimate.covariance[epochs], states))
         for sensor, innovations in estimate.innovations.items():
-            total = found.nis.setdefault(sensor, np.zeros(2))
+            total = study.nis.setdefault(sensor, np.zeros(2))
             total += (innovations.nis.sum(), innovations.innovation.size)
-    return found
+    return study
 
 
-def judge(found: Study, probability: float = 0.99) -> list[str]:
+def judge(study: Study, probability: float = 0.99) -> list[str]:
     """Return what lies outside its two-sided bounds, all together held with ``probability`` by a right filter."""
-    each = 1.0 - (1.0 - probability) / (len(found.nees) + len(found.nis))
+    each = 1.0 - (1.0 - probability) / (len(study.nees) + len(study.nis))
     wrong = []
-    for subset in found.nees:
-        verdict = found.verdict(subset, each)
+    for subset in study.nees:
+        verdict = study.verdict(subset, each)
         if not verdict.consistent:
             wrong.append(f"NEES of the {subset}: {verdict.mean} outside {verdict.simultaneous_bounds}")
-    for sensor, (total, degrees) in found.nis.items():
+    for sensor, (total, degrees) in study.nis.items():
         low, high = consistency.mean_bounds(1, degrees / SHARED.get(sensor, 1.0), each)
         if not low < total / degrees < high:
             wrong.append(f"NIS of {sensor}: {total / degrees} outside {low, high}")
@@ -95,9 +95,11 @@ def test_every_built_in_scenario_is_here():
 
 @pytest.mark.parametrize("name", CALLED_FOR)
 def test_the_states_are_those_that_the_errors_call_for(name):
-    chosen, scenario = matched(name), scenarios.load_scenario(name)
-    assert (() if chosen.states is None else chosen.states.names) == CALLED_FOR[name]
-    missing = setup.unmodelled_errors(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    filter_setup, scenario = matched(name), scenarios.load_scenario(name)
+    assert (() if filter_setup.states is None else filter_setup.states.names) == CALLED_FOR[name]
+    missing = setup.unmodelled_errors(
+        scenario.gyro, scenario.sensors, filter_setup.states, gravity_f=scenario.gravity_f
+    )
     assert missing == (("the gyro's quantisation",) if name == "hand-held" else ())
 
 
@@ -136,27 +138,28 @@ def test_nis_and_anees_are_inside_their_bounds_over_many_runs(name, individuals)
     if name == "coning" and not individuals:
         # Scale factor, misalignments and the force's bias add up about the cone's axis, in every run alike: that is no draw, and the
         # bias has more than its σ says (ANEES 1.3 to 1.45).
-        wrong = [one for one in wrong if "attitude" in one or "NIS" in one]
+        wrong = [text for text in wrong if "attitude" in text or "NIS" in text]
     assert wrong == []
 
 
 def test_the_quicker_part_of_flicker_is_reported_of_the_bias():
     """Without it the bias of a filter with drifts has too small a σ, for the truth holds all of the flicker."""
     scenario = scenarios.load_scenario("hand-held")
-    chosen = matched("hand-held")
+    filter_setup = matched("hand-held")
     record = scenarios.simulate(scenario, 1)
-    initial = start(record, chosen, 1, 0)
-    quiet = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_fast_bias_sigma=0.0))
-    fast = chosen.states.gyro_fast_bias_sigma**2
+    initial = start(record, filter_setup, 1, 0)
+    states = filter_setup.states
+    quiet = dataclasses.replace(filter_setup, states=dataclasses.replace(states, gyro_fast_bias_sigma=0.0))
+    fast = states.gyro_fast_bias_sigma**2
     wider = dataclasses.replace(initial, covariance=initial.covariance + fast * np.diag([0, 0, 0, 1, 1, 1]))
-    one = setup.run(record, chosen, initial, full_covariance=True, every=1000)
+    estimate = setup.run(record, filter_setup, initial, full_covariance=True, every=1000)
     other = setup.run(record, quiet, wider, full_covariance=True, every=1000)
-    np.testing.assert_allclose(one.variance[1:, 3:] - other.variance[1:, 3:], fast, rtol=1e-9)
-    np.testing.assert_allclose(one.variance[0, 3:], np.diag(initial.covariance)[3:], rtol=1e-9)
-    np.testing.assert_allclose(np.einsum("kii->ki", one.covariance), one.variance, rtol=1e-12)
+    np.testing.assert_allclose(estimate.variance[1:, 3:] - other.variance[1:, 3:], fast, rtol=1e-9)
+    np.testing.assert_allclose(estimate.variance[0, 3:], np.diag(initial.covariance)[3:], rtol=1e-9)
+    np.testing.assert_allclose(np.einsum("kii->ki", estimate.covariance), estimate.variance, rtol=1e-12)
     # Closed form: B²/(2πf) cos²(πf), the mean of neighbouring intervals, minus the drifts, from the shortest drift's time constant up.
-    step, times = 1.0 / scenario.rate, np.array(chosen.states.gyro_drift_time)
+    step, times = 1.0 / scenario.rate, np.array(states.gyro_drift_time)
     turns = np.array([step / (times[-1] * np.sqrt(10.0)), np.pi])  # 2πf of the two ends
     flicker = 0.5 * np.max(scenario.gyro.bias_instability) ** 2 / np.pi * np.diff(np.log(turns) + sici(turns)[1])
-    drifts = 2.0 / np.pi * np.square(chosen.states.gyro_drift_sigma) @ np.diff(np.arctan(np.outer(times / step, turns)))
+    drifts = 2.0 / np.pi * np.square(states.gyro_drift_sigma) @ np.diff(np.arctan(np.outer(times / step, turns)))
     np.testing.assert_allclose(fast, flicker - drifts, rtol=1e-3)

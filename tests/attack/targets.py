@@ -56,8 +56,8 @@ def targets(folder: Path) -> list[Target]:
     (folder / "scenario.toml").write_text(scenarios.scenario_to_toml(scenarios.load_scenario("tumbling-satellite")))
     attitude = scenarios.scenario_to_toml(scenarios.load_scenario("slew-vibration")).split("[[sensors]]")[0] + _TRACKER
     (folder / "attitude.toml").write_text(attitude)
-    chosen = setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
-    (folder / "filter.toml").write_text(setup.to_toml(chosen) + _GATE)
+    filter_setup = setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
+    (folder / "filter.toml").write_text(setup.to_toml(filter_setup) + _GATE)
     (folder / "gyro.toml").write_text(
         '[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.1\n"scale_factor_ppm" = [1, 2, 3]\n'
     )
@@ -113,7 +113,7 @@ def foreign(folder: Path) -> list[Target]:
         true_attitude=quaternion.normalize(draw.standard_normal((n, 4))),
         epoch_ns=1_700_000_000_123_456_789,
     )
-    found = []
+    files = []
     for ending, share in FOREIGN.items():
         path = folder / f"flight.{ending}"
         damages: tuple[Damage, ...] = damage.BYTES
@@ -142,12 +142,12 @@ def foreign(folder: Path) -> list[Target]:
                 "parquet": (damage.change_parquet,) * 2,
             }
             damages += more.get(ending, ())
-        found.append(Target(path.name, path.read_bytes(), read, damages, share))
+        files.append(Target(path.name, path.read_bytes(), read, damages, share))
         if ending in ("bag", "mcap", "ulg"):
             topic = "" if ending == "ulg" else "/imu/reference"
             read = functools.partial(attitudes.read_attitudes, topic=topic)
-            found.append(Target(path.name, path.read_bytes(), read, damages, 0.3 * share))
-    return found
+            files.append(Target(path.name, path.read_bytes(), read, damages, 0.3 * share))
+    return files
 
 
 def _write_estimate(path: Path) -> None:
@@ -187,7 +187,7 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         "sensor_degrees": (s, 2),
         "sensor_refused": (s, 2),
     }
-    found = sums.Statistics(
+    statistics = sums.Statistics(
         time=plan.time,
         nis_edges=plan.nis_edges,
         sensors=plan.sensors,
@@ -198,8 +198,8 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         **{name: np.zeros(shape) for name, shape in zeros.items()},
         **{name: np.zeros(shape, np.int64) for name, shape in counts.items()},
     )
-    held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=found)
-    campaign._write(path, held, campaign._Progress(found, {}, 4), plan.to_table())
+    held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=statistics)
+    campaign._write(path, held, campaign._Progress(statistics, {}, 4), plan.to_table())
 
 
 _TRACKER = """[[sensors]]

@@ -106,7 +106,7 @@ def test_damaged_files_are_read_right_or_refused_by_name(tmp_path, folder, reque
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for k in range(number):
-                (target,) = chance.choices(known, [one.share for one in known])
+                (target,) = chance.choices(known, [candidate.share for candidate in known])
                 change = chance.choice(target.damages)
                 content = change(chance, target.content)
                 while content == target.content:  # no damage: zeros for zeros
@@ -136,5 +136,5 @@ def test_damaged_files_are_read_right_or_refused_by_name(tmp_path, folder, reque
     assert spent < CPU_SECONDS * number / DEFAULT
     kinds = {target.name for target in known}
     for outcome in ("read", "refused"):  # or the damage is no damage, or nothing else than damage
-        seen = {name.split()[0] for name in outcomes if name.endswith(outcome)}
-        assert seen >= kinds - ({"record.h5", "estimate.h5", "campaign.h5"} if outcome == "read" else set())
+        names = {name.split()[0] for name in outcomes if name.endswith(outcome)}
+        assert names >= kinds - ({"record.h5", "estimate.h5", "campaign.h5"} if outcome == "read" else set())

@@ -41,14 +41,14 @@ def test_covariances_stay_positive_definite_for_ever(request, states):
     )
     if states:
         scenario = dataclasses.replace(scenario, gyro=dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4)))
-    chosen = setup.FilterSetup.for_scenario(scenario, states=states)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=states)
     record = scenarios.simulate(scenario, 5)
-    state = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
+    state = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
     ends = record.truth.attitude[0], record.truth.attitude[-1]
     for _ in range(max(1, passes(request) // (10 if states else 1) // CHUNK)):
-        found = setup.run(record, chosen, state, every=1000, full_covariance=True)
-        need_sound(found)
+        estimate = setup.run(record, filter_setup, state, every=1000, full_covariance=True)
+        need_sound(estimate)
         # The next pass begins at the record's start with the error of this one's end.
-        error = quaternion.multiply(quaternion.conjugate(ends[1]), found.attitude[-1])
+        error = quaternion.multiply(quaternion.conjugate(ends[1]), estimate.attitude[-1])
         attitude = quaternion.normalize(quaternion.multiply(ends[0], error))
-        state = estimation.State(attitude=attitude, bias=record.truth.bias[0], covariance=found.covariance[-1])
+        state = estimation.State(attitude=attitude, bias=record.truth.bias[0], covariance=estimate.covariance[-1])
