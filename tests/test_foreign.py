@@ -661,7 +661,10 @@ def test_the_command_refuses(files, monkeypatch, capsys):
         (["check", files / "estimate.tum"], "has no innovations, so it cannot be judged without a truth"),
         (["check", files / "estimate.h5", "--align", "none"], "--align goes with --truth"),
         (["check", files / "estimate.csv", "--truth", files / "record.h5", "--align", "clock"], "align"),
-        (["check", files / "estimate.csv", "--truth", files / "record.h5", "--error-frame", "ned"], "--error-frame 'ned'"),
+        (
+            ["check", files / "estimate.csv", "--truth", files / "record.h5", "--error-frame", "ned"],
+            "--error-frame 'ned'",
+        ),
         (
             ["check", files / "estimate.csv", "--truth", files / "record.h5", "--record", files / "record.h5"],
             "leave out --truth",
