@@ -44,7 +44,7 @@ def resting(*vectors, time=(0.0, 1.0)) -> ImuRecord:
     return ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=vectors)
 
 
-def seen(attitude, reference):
+def in_body(attitude, reference):
     """Return references of the fixed frame in body axes."""
     return quaternion.rotate(quaternion.conjugate(attitude), reference)
 
@@ -63,7 +63,7 @@ def record_of(body=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> 
 
     def seen_at(interval, phase, reference, sigma):
         t = np.arange(phase, duration, interval)
-        return t, seen(body.attitude(t), reference) + sigma * rng.standard_normal((len(t), 3))
+        return t, in_body(body.attitude(t), reference) + sigma * rng.standard_normal((len(t), 3))
 
     t, mag = seen_at(0.11, 0.013, FIELD, 5e-7)
     mag = series_of("mag", "vector", t, mag + np.array([3e-6, -2e-6, 1e-6]), FIELD, 5e-7)
@@ -79,7 +79,7 @@ def record_of(body=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> 
     tracker = VectorMeasurements(sensor="tracker", kind="attitude", time=t, attitude=attitude, sigma_axes=axes)
     t = np.arange(0.11, duration, 0.23)
     moving = np.stack([np.cos(t), np.sin(t), 0.5 + 0.1 * t], axis=-1)
-    beacon = series_of("beacon", "vector", t, seen(body.attitude(t), moving), moving, 0.02)
+    beacon = series_of("beacon", "vector", t, in_body(body.attitude(t), moving), moving, 0.02)
     return ImuRecord(time=edges, increments=increments, vectors=(mag, force, compass, tracker, beacon))
 
 

@@ -9,7 +9,7 @@ import in_steps
 import mpmath
 import numpy as np
 import pytest
-from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, record_of, resting, seen, series_of, turn_to
+from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, in_body, record_of, resting, series_of, turn_to
 from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
@@ -566,7 +566,7 @@ def plain_record(body_motion, duration=20.0):
         ("mag", FIELD, 5e-7, np.array([4e-6, -6e-6, 2e-6])),
         ("force", UP, 0.05, np.zeros(3)),
     ):
-        z = seen(body_motion.attitude(edges[1::5]), r) + offset + sigma * rng.standard_normal((len(edges[1::5]), 3))
+        z = in_body(body_motion.attitude(edges[1::5]), r) + offset + sigma * rng.standard_normal((len(edges[1::5]), 3))
         series.append(series_of(name, "vector", edges[1::5], z, r, sigma))
     increments = body_motion.increments(edges) + 1e-3 * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series))
@@ -731,7 +731,7 @@ def test_the_covariance_stays_positive_definite(sharpness):
     edges = np.arange(10001) / 100.0
     sensors = []
     for name, r in (("mag", FIELD / np.linalg.norm(FIELD)), ("force", UP / 9.81)):
-        z = seen(SWAY.attitude(edges[1:]), r)
+        z = in_body(SWAY.attitude(edges[1:]), r)
         sensors.append(series_of(name, "vector", edges[1:], z, r, 0.03 * sharpness))
     increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
     record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from measured import FIELD, HAND, UP, drawn_start, seen, series_of
+from measured import FIELD, HAND, UP, drawn_start, in_body, series_of
 
 from strapdown import consistency, estimation, gyro, quaternion
 from strapdown.checks import InputError
@@ -231,7 +231,7 @@ def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
         sway[k] = phi * sway[k - 1] + np.sqrt(1.0 - phi**2) * sway[k]
     series = []
     for name, reference, noise, extra in (("acc", UP, 0.05, sway), ("mag", FIELD, 5e-7, np.zeros(3))):
-        z = seen(HAND.attitude(time), reference + extra) + noise * rng.standard_normal(sway.shape)
+        z = in_body(HAND.attitude(time), reference + extra) + noise * rng.standard_normal(sway.shape)
         series.append(series_of(name, "vector", time, z, reference, noise))
     increments = HAND.increments(edges) + ARW * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
     block = error_states.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")

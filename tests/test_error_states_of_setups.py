@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import FIELD, drawn_start, resting, seen, series_of, turn_to, unit
+from measured import FIELD, drawn_start, in_body, resting, series_of, turn_to, unit
 from measured import HAND as SWAY
 
 from strapdown import estimation, kinematics, motion, quaternion, scenarios, vectors
@@ -278,7 +278,7 @@ def test_an_accelerometer_at_an_arm_feels_the_turning_body(kind):
     kernels, length = forward.instance_of(model), 9.81 if kind == "vector" else 1.0
 
     def felt(r):
-        return seen(q, up) + np.cross(turning, r) + np.cross(rate, np.cross(rate, r))
+        return in_body(q, up) + np.cross(turning, r) + np.cross(rate, np.cross(rate, r))
 
     def residual(measured, r):
         z = measured / 9.81 if kind == "vector" else unit(measured)

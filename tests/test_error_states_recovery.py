@@ -16,9 +16,9 @@ from measured import (
     assert_inside,
     drawn_start,
     errors,
+    in_body,
     recoveries,
     sample,
-    seen,
     series_of,
     unit,
 )
@@ -98,7 +98,7 @@ def simulated(
 
 def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
     def seen_by(reference):
-        return seen(HAND.attitude(time), reference)
+        return in_body(HAND.attitude(time), reference)
 
     def white(sigma):
         return sigma * rng.standard_normal((len(time), 3))
@@ -333,8 +333,8 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     rng = np.random.default_rng(seed)
     true, guess = unit(rng.standard_normal(4)), unit(rng.standard_normal(4))
     iron = 1e-6 * rng.standard_normal(3)
-    mag = seen(true, FIELD) + iron + 3e-7 * rng.standard_normal(3)
-    acc = seen(true, UP) + 0.05 * rng.standard_normal(3)
+    mag = in_body(true, FIELD) + iron + 3e-7 * rng.standard_normal(3)
+    acc = in_body(true, UP) + 0.05 * rng.standard_normal(3)
     start = estimation.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
     face = GatedStepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
@@ -343,8 +343,8 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
 
     def residuals(p):
         q = quaternion.multiply(true, quaternion.exp(p[:3]))
-        field = seen(q, FIELD) + 1e-6 * p[3:]
-        return np.concatenate([(mag - field) / 3e-7, (acc - seen(q, UP)) / 0.05, p[3:]])
+        field = in_body(q, FIELD) + 1e-6 * p[3:]
+        return np.concatenate([(mag - field) / 3e-7, (acc - in_body(q, UP)) / 0.05, p[3:]])
 
     solution = least_squares(residuals, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     best = quaternion.multiply(true, quaternion.exp(solution.x[:3]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from measured import SWAY as BODY
-from measured import UP, assert_inside, recoveries, resting, seen, series_of, turn_to
+from measured import UP, assert_inside, in_body, recoveries, resting, series_of, turn_to
 
 from strapdown import consistency, estimation, kinematics, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
@@ -96,7 +96,7 @@ def root_inverse(P):
 def predicted_vectors(blocks, series, q, c, W):
     a, d, U, lever = effects_on(blocks, series.sensor)
     r = series.reference_f + np.einsum("mk,ki->mi", c, d)
-    z = seen(q, r)
+    z = in_body(q, r)
     z = z + np.einsum("mk,kij,mj->mi", c, U, z) + c @ a
     return z + np.einsum("mij,kj,mk->mi", W, lever, c)
 
@@ -303,7 +303,7 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     estimates = []
     for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
         acc = series_of("acc", "vector", [at], [felt], UP, 0.05)
-        mag = series_of("mag", "vector", [at], [seen(true, FIELD)], FIELD, 0.01)
+        mag = series_of("mag", "vector", [at], [in_body(true, FIELD)], FIELD, 0.01)
         estimates.append(run(resting(acc, mag), still, initial, blocks, full_covariance=True))
     assert difference(*estimates, 0, 0) < 1e-6
     assert np.linalg.norm(quaternion.log(estimates[0].attitude[0])) > 0.9
@@ -352,7 +352,7 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
         ("acc", UP, 0.05, np.arange(0.013, duration, 0.11)),
         ("mag", FIELD, 0.02, np.nextafter(time[5::10], np.where(np.arange(len(time[5::10])) % 3 == 0, 9.0, 0.0))),
     ):
-        z = seen(BODY.attitude(at), reference)
+        z = in_body(BODY.attitude(at), reference)
         series.append(series_of(name, "vector", at, z + sigma * rng.standard_normal(z.shape), reference, sigma))
     attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
     truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from measured import UP, assert_inside, drawn_start, seen, series_of, unit, waves
+from measured import UP, assert_inside, drawn_start, in_body, series_of, unit, waves
 
 from benchmarks import recordings as leaderboard
 from sims import hand_held
@@ -278,9 +278,9 @@ def record_of(
     every = np.union1d(np.round(edges, 9), np.round(time, 9))
     path = acceleration_path(block, every, rng)
     felt = path["acceleration"][np.searchsorted(every, np.round(time, 9))] + UP
-    force = seen(HAND.attitude(time), felt) + sigma * rng.standard_normal((len(time), 3))
+    force = in_body(HAND.attitude(time), felt) + sigma * rng.standard_normal((len(time), 3))
     north = np.array([0.0, 1.0, 0.0])
-    compass = seen(HAND.attitude(edges[5::10]), north)
+    compass = in_body(HAND.attitude(edges[5::10]), north)
     compass = compass + 0.05 * rng.standard_normal(compass.shape)
     if kind == "vector":
         acc = series_of("acc", kind, time, force, UP, sigma)

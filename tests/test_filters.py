@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
-from measured import drawn_start, errors, resting, seen, series_of, turn_to
+from measured import drawn_start, errors, in_body, resting, series_of, turn_to
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
 from scipy.optimize import brentq
@@ -138,7 +138,7 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
     M = rng.standard_normal((6, 6)) * 1e-5
     initial = estimation.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=np.zeros(3), covariance=M @ M.T)
     r, sigma = REFERENCES["direction"], 1e-5
-    r_b = seen(initial.attitude, r)
+    r_b = in_body(initial.attitude, r)
     off = 2e-5 * rng.standard_normal(3)
     rows = np.linalg.svd(r_b[None])[2][1:] if kind == "direction" else np.eye(3)
     if kind == "attitude":
@@ -176,7 +176,7 @@ def test_invariant_filters_never_see_what_one_reference_hides():
     about = {}
     for name in ("mekf", *comparison.EXTENDED):
         estimate = own_filter(name, BELIEF).run(record, initial)
-        r_b = seen(estimate.attitude, r)
+        r_b = in_body(estimate.attitude, r)
         about[name] = np.einsum("ki,kij,kj->k", r_b, estimate.covariance[:, :3, :3], r_b)
     for name in ("right-invariant", "two-frame"):
         assert np.all(np.diff(about[name]) > -1e-9)
@@ -244,7 +244,7 @@ def inverse_matrix(q):
 class SlowFilter:
     """A filter of the family from nothing but what it calls the error: ``moved`` and ``seen``; all Jacobians are numeric.
 
-    ``moved(q, b, xi)`` is the state that lies the error xi (6,) from (q, b), ``seen(q, b, q1, b1)`` the error of (q1, b1) near by. With
+    ``moved(q, b, xi)`` is the state that lies the error xi (6,) from (q, b), ``error_of(q, b, q1, b1)`` the error of (q1, b1) near by. With
     ``resets`` the covariance is carried to the error about the corrected state, else it stays.
     """
 
@@ -252,7 +252,7 @@ class SlowFilter:
         self.name = name
         self.resets = name == "mekf"
         self.q, self.b = initial.attitude, initial.bias
-        back = derivative(lambda e: self.seen(*self.body_moved(e)), 6)
+        back = derivative(lambda e: self.error_of(*self.body_moved(e)), 6)
         self.P = back @ initial.covariance @ back.T
 
     def moved(self, q, b, xi):
@@ -266,9 +266,9 @@ class SlowFilter:
             c = times(inverse_matrix(q) @ kinematics.right_jacobian(a), c)
         return quaternion.multiply(turn, q), b + c
 
-    def seen(self, q1, b1):
-        in_body = self.name in ("mekf", "geometric")
-        pair = (quaternion.conjugate(self.q), q1) if in_body else (q1, quaternion.conjugate(self.q))
+    def error_of(self, q1, b1):
+        body_side = self.name in ("mekf", "geometric")
+        pair = (quaternion.conjugate(self.q), q1) if body_side else (q1, quaternion.conjugate(self.q))
         a = quaternion.log(quaternion.multiply(*pair))
         c = b1 - self.b
         if self.name == "geometric":
@@ -287,7 +287,7 @@ class SlowFilter:
             return quaternion.multiply(state[0], quaternion.exp((rate - state[1]) * span)), state[1]
 
         self.q, self.b = flown(start, dt)
-        transition = derivative(lambda xi: self.seen(*flown(self.moved(*start, xi), dt)), 6)
+        transition = derivative(lambda xi: self.error_of(*flown(self.moved(*start, xi), dt)), 6)
         Q = np.zeros((6, 6))
         density = np.diag([noise.angle_random_walk**2] * 3 + [noise.rate_random_walk**2] * 3)
         for node, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True):
@@ -295,7 +295,9 @@ class SlowFilter:
             q, b = flown(start, t)
 
             def pushed(e, q=q, b=b, t=t):
-                return self.seen(*flown((quaternion.multiply(q, quaternion.exp(e[..., :3])), b + e[..., 3:]), dt - t))
+                return self.error_of(
+                    *flown((quaternion.multiply(q, quaternion.exp(e[..., :3])), b + e[..., 3:]), dt - t)
+                )
 
             J = derivative(pushed, 6)
             Q += 0.5 * dt * weight * J @ density @ J.T
@@ -335,7 +337,7 @@ class SlowFilter:
         self.P = (np.eye(6) - K @ H) @ self.P @ (np.eye(6) - K @ H).T + K @ N @ K.T
         self.q, self.b = self.moved(q, b, xi)
         if self.resets:
-            G = derivative(lambda e: self.seen(*self.moved(q, b, xi + e)), 6)
+            G = derivative(lambda e: self.error_of(*self.moved(q, b, xi + e)), 6)
             self.P = G @ self.P @ G.T
         return float(y @ np.linalg.solve(S, y))
 
@@ -482,12 +484,12 @@ def test_complementary_filter_follows_the_paper_in_the_limit(kind):
     """
     r, true, gyro = np.array([0.0, 0.6, 0.8]), quaternion.exp([0.1, 0.2, 0.3]), np.array([0.02, -0.01, 0.03])
     kp, ki, duration, n = 1.0, 0.3, 4.0, 4000
-    z = seen(true, r)
+    z = in_body(true, r)
     start = quaternion.multiply(true, quaternion.exp([1.0, -0.8, 0.5] if kind == "direction" else [1.5, -1.0, 0.8]))
 
     def slope(t, y):
         q = quaternion.normalize(y[:4])
-        omega = np.cross(z, seen(q, r))
+        omega = np.cross(z, in_body(q, r))
         if kind == "attitude":
             error = quaternion.to_matrix(q).T @ quaternion.to_matrix(true)
             skew = 0.5 * (error - error.T)

@@ -9,7 +9,7 @@ import in_steps
 import mpmath
 import numpy as np
 import pytest
-from measured import EVERY_KIND, STAR, SWAY, record_of, resting, seen, series_of, turn_to, unit
+from measured import EVERY_KIND, STAR, SWAY, in_body, record_of, resting, series_of, turn_to, unit
 from scipy.spatial.transform import Rotation
 from square_root import SquareRootFilter
 
@@ -312,7 +312,7 @@ def tracked(sigma, sharp=None, duration=6.0, states=()):
         ("third", np.array([0.5 * duration]), np.array([0.3, -0.2, 0.9]), sharp),
     ):
         if noise:
-            vector = seen(SWAY.attitude(at), unit(r)) + noise * random.standard_normal((len(at), 3))
+            vector = in_body(SWAY.attitude(at), unit(r)) + noise * random.standard_normal((len(at), 3))
             # With states as a whole vector, for the structure of other tests: its length says nothing.
             series.append(series_of(name, "vector" if states else "direction", at, unit(vector), unit(r), noise))
     return replace(record, vectors=tuple(series))

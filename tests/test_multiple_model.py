@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from measured import assert_inside, errors, resting, seen, series_of, turn_to, unit
+from measured import assert_inside, errors, in_body, resting, series_of, turn_to, unit
 from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
@@ -33,7 +33,7 @@ def still(attitude, references, sigma, random, *, seconds=20, phases=None):
     for k, reference in enumerate(references):
         r = np.asarray(reference) / np.linalg.norm(reference)
         at = time[:-1] + (0.0 if phases is None else phases[k])
-        noisy = seen(attitude, r) + sigma * random.standard_normal((len(at), 3))
+        noisy = in_body(attitude, r) + sigma * random.standard_normal((len(at), 3))
         vectors.append(series_of(f"star {k}", "direction", at, unit(noisy), r, sigma))
     return ImuRecord(time=time, increments=np.zeros((seconds, 3)), vectors=tuple(vectors))
 

@@ -22,26 +22,26 @@ def random_pairs(n: int = 200, seed: int = 1) -> tuple[Rotation, Rotation]:
 def test_against_scipy():
     """Total: SciPy's magnitude. Inclination: the angle between both verticals. Heading: the twist about the vertical, by projection."""
     estimate, reference = random_pairs()
-    found = reference_errors(scalar_first(estimate), scalar_first(reference))
+    errors = reference_errors(scalar_first(estimate), scalar_first(reference))
     difference = estimate * reference.inv()
-    np.testing.assert_allclose(found.total, difference.magnitude(), atol=1e-7)
+    np.testing.assert_allclose(errors.total, difference.magnitude(), atol=1e-7)
     tilted = difference.apply(UP)
-    np.testing.assert_allclose(found.inclination, np.arccos(np.clip(tilted[:, 2], -1.0, 1.0)), atol=1e-7)
+    np.testing.assert_allclose(errors.inclination, np.arccos(np.clip(tilted[:, 2], -1.0, 1.0)), atol=1e-7)
     # the shortest rotation takes the vertical to where the difference has it; what is left is the twist about the vertical
     axis = np.cross(UP, tilted)
-    swing = Rotation.from_rotvec(axis / np.linalg.norm(axis, axis=1)[:, None] * found.inclination[:, None])
+    swing = Rotation.from_rotvec(axis / np.linalg.norm(axis, axis=1)[:, None] * errors.inclination[:, None])
     twist = swing.inv() * difference
     np.testing.assert_allclose(twist.apply(UP), np.tile(UP, (200, 1)), atol=1e-9)
-    np.testing.assert_allclose(found.heading, twist.magnitude(), atol=1e-7)
+    np.testing.assert_allclose(errors.heading, twist.magnitude(), atol=1e-7)
 
 
 def test_against_the_formulas_of_the_benchmark():
     estimate, reference = random_pairs(seed=2)
-    found = reference_errors(scalar_first(estimate), scalar_first(reference))
+    errors = reference_errors(scalar_first(estimate), scalar_first(reference))
     d = scalar_first(estimate * reference.inv())
-    np.testing.assert_allclose(found.total, 2 * np.arccos(np.abs(d[:, 0])), atol=1e-7)
-    np.testing.assert_allclose(found.heading, 2 * np.arctan(np.abs(d[:, 3] / d[:, 0])), atol=1e-12)
-    np.testing.assert_allclose(found.inclination, 2 * np.arccos(np.sqrt(d[:, 0] ** 2 + d[:, 3] ** 2)), atol=1e-7)
+    np.testing.assert_allclose(errors.total, 2 * np.arccos(np.abs(d[:, 0])), atol=1e-7)
+    np.testing.assert_allclose(errors.heading, 2 * np.arctan(np.abs(d[:, 3] / d[:, 0])), atol=1e-12)
+    np.testing.assert_allclose(errors.inclination, 2 * np.arccos(np.sqrt(d[:, 0] ** 2 + d[:, 3] ** 2)), atol=1e-7)
 
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-8, 1e-3, 0.5, 3.0])
@@ -51,36 +51,36 @@ def test_pure_errors_of_any_size(angle):
     level = np.array([0.6, -0.8, 0.0])
     for axis, heading, inclination in ((UP, angle, 0.0), (-UP, angle, 0.0), (level, 0.0, angle)):
         estimate = Rotation.from_rotvec(angle * axis) * reference
-        found = reference_errors(scalar_first(estimate), scalar_first(reference))
-        np.testing.assert_allclose(found.total, angle, rtol=1e-14, atol=1e-15)
-        np.testing.assert_allclose(found.heading, heading, rtol=1e-14, atol=4e-15)
-        np.testing.assert_allclose(found.inclination, inclination, rtol=1e-14, atol=4e-15)
+        errors = reference_errors(scalar_first(estimate), scalar_first(reference))
+        np.testing.assert_allclose(errors.total, angle, rtol=1e-14, atol=1e-15)
+        np.testing.assert_allclose(errors.heading, heading, rtol=1e-14, atol=4e-15)
+        np.testing.assert_allclose(errors.inclination, inclination, rtol=1e-14, atol=4e-15)
 
 
 def test_errors_are_of_the_fixed_frame():
     """An error about the body's z axis of a body that lies on its side is one of inclination."""
     lying = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
-    found = reference_errors(
+    errors = reference_errors(
         scalar_first(lying * Rotation.from_rotvec([0.0, 0.0, 0.1]))[None], scalar_first(lying)[None]
     )
-    np.testing.assert_allclose([found.heading[0], found.inclination[0]], [0.0, 0.1], atol=1e-15)
+    np.testing.assert_allclose([errors.heading[0], errors.inclination[0]], [0.0, 0.1], atol=1e-15)
 
 
 def test_sign_of_the_quaternions_does_not_matter():
     estimate, reference = (scalar_first(r) for r in random_pairs(20))
-    one, other = reference_errors(estimate, reference), reference_errors(-estimate, reference)
+    errors, other = reference_errors(estimate, reference), reference_errors(-estimate, reference)
     for name in ("total", "heading", "inclination"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_array_equal(getattr(errors, name), getattr(other, name))
 
 
 def test_missing_references_give_nan_and_are_not_judged():
     estimate, reference = (scalar_first(r) for r in random_pairs(6))
     reference[[1, 4]] = np.nan
     reference[2, 3] = np.nan
-    found = reference_errors(estimate, reference)
-    np.testing.assert_array_equal(np.isnan(found.total), [False, True, True, False, True, False])
-    np.testing.assert_array_equal(np.isnan(found.heading), np.isnan(found.inclination))
-    assert np.isfinite(list(found.rms().values())).all()
+    errors = reference_errors(estimate, reference)
+    np.testing.assert_array_equal(np.isnan(errors.total), [False, True, True, False, True, False])
+    np.testing.assert_array_equal(np.isnan(errors.heading), np.isnan(errors.inclination))
+    assert np.isfinite(list(errors.rms().values())).all()
 
 
 def test_single_precision_references_are_taken():

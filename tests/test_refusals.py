@@ -173,9 +173,9 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     recordfiles.write_record(tmp_path / "record.h5", dataclasses.replace(held, origin=origin))
     shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
     with changed(tmp_path / "estimate.h5") as file:
-        chosen = setup.from_toml(reading.attributes(file)["filter"])
+        filter_setup = setup.from_toml(reading.attributes(file)["filter"])
         states = States(gyro_scale_sigma=1e-3)
-        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=states))
+        file.attrs["filter"] = setup.to_toml(dataclasses.replace(filter_setup, states=states))
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
     result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
     assert result.exit_code in (0, 3), result.output
@@ -280,7 +280,7 @@ def test_every_command_that_writes_is_held_to_it():
     writing = {
         name
         for name, command in group.commands.items()
-        if {"--out", "--json"} & {flag for one in command.params for flag in one.opts}
+        if {"--out", "--json"} & {flag for parameter in command.params for flag in parameter.opts}
     }
     assert writing == set(FOLDERS) | {name for name in FILES if " " not in name}
 
@@ -375,7 +375,7 @@ def test_scenarios_of_impossible_numbers_are_reported_by_their_keys(
     ],
 )
 def test_covariance_refuses_errors_that_nothing_has(there, tmp_path, errors, words):
-    options = [f"--consider={one}" for one in errors]
+    options = [f"--consider={error}" for error in errors]
     said = refused_at_once(["covariance", "short.toml", "--epochs", 2, *options, "--out", tmp_path / "new"])
     assert words in said
     assert not list(tmp_path.iterdir())

@@ -42,11 +42,11 @@ def filter_setup(scenario):
     )
 
 
-def estimate_of(scenario, chosen):
+def estimate_of(scenario, filter_setup):
     record = scenarios.simulate(scenario, 3)
-    start = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
-    estimate = setup.run(record, chosen, start, full_covariance=True)
-    return estimate, records.compress(record, chosen.integration).truth
+    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, filter_setup, start, full_covariance=True)
+    return estimate, records.compress(record, filter_setup.integration).truth
 
 
 @pytest.fixture(scope="module")
@@ -128,8 +128,8 @@ def columns(content):
     time = content["time"]["first"] + content["time"]["tick"] * unpacked(content["time"], "<i4")
     block = np.arange(len(time)) // page.BLOCK
     return time, *(
-        np.where(whole == -32768, np.nan, np.array(one["offset"])[block] + np.array(one["scale"])[block] * whole)
-        for one, whole in zip(content["data"], integers, strict=True)
+        np.where(whole == -32768, np.nan, np.array(column["offset"])[block] + np.array(column["scale"])[block] * whole)
+        for column, whole in zip(content["data"], integers, strict=True)
     )
 
 
@@ -182,15 +182,17 @@ def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
 
 def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folder):
     statistics = sd.read(folder / "campaign.h5").statistics
-    (chart,) = (one for one in charts_of(body(folder / "campaign.html")) if one["title"].startswith("|bias y error|"))
+    (chart,) = (
+        chart for chart in charts_of(body(folder / "campaign.html")) if chart["title"].startswith("|bias y error|")
+    )
     assert chart["log"]  # from 26 to 0.4 °/h
     assert chart["unit"].endswith("°/h")
-    assert [one["label"].split(" %")[0] for one in chart["series"]] == ["99", "50", "99", "50"]
+    assert [series["label"].split(" %")[0] for series in chart["series"]] == ["99", "50", "99", "50"]
     sigma = statistics.sigma[:, 4] / DEGREE_PER_HOUR
     quantiles = [statistics.error_quantile(share)[:, 4] / DEGREE_PER_HOUR for share in (0.99, 0.5)]
     predicted = [scipy.stats.norm.ppf(0.5 + 0.5 * share) * sigma for share in (0.99, 0.5)]
-    for found, wanted in zip(columns(chart)[1:], [*quantiles, *predicted], strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=2e-5 * wanted.max())
+    for drawn, wanted in zip(columns(chart)[1:], [*quantiles, *predicted], strict=True):
+        np.testing.assert_allclose(drawn, wanted, rtol=1e-4, atol=2e-5 * wanted.max())
 
 
 def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
@@ -246,8 +248,8 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
         np.testing.assert_allclose(top, course["bounds"][1], rtol=1e-9)
         np.testing.assert_allclose(after, np.array(course["mean"], float), atol=1e-3)
     if headless.CHROMIUM is not None:
-        found = headless.reported(tmp_path / "filter.html", DRAWN, 1000, "--virtual-time-budget=20000")
-        assert (found["drawn"], found["console"]) == ("4", [])
+        reported = headless.reported(tmp_path / "filter.html", DRAWN, 1000, "--virtual-time-budget=20000")
+        assert (reported["drawn"], reported["console"]) == ("4", [])
     with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
@@ -270,16 +272,16 @@ def coning_json(tmp_path_factory):
 def test_a_coning_study_is_reported_from_its_json(coning_json, tmp_path):
     study = json.loads(coning_json.read_text())
     content = body(report.write(coning_json).page)
-    passing = sum(one["consistent"] for one in study["filter"])
+    passing = sum(row["consistent"] for row in study["filter"])
     assert f"{passing} of {len(study['filter'])} algorithms give a consistent filter" in content.split("<h2>")[0]
     drift = charts_of(content)[0]
-    assert drift["ticks"] == [one["algorithm"] for one in study["integration"]]
-    measured = [abs(one["drift_deg_per_hour"]) for one in study["integration"]]
+    assert drift["ticks"] == [row["algorithm"] for row in study["integration"]]
+    measured = [abs(row["drift_deg_per_hour"]) for row in study["integration"]]
     np.testing.assert_allclose(columns(drift)[1][:3], measured[:3], rtol=2e-3)
     assert np.isnan(columns(drift)[1][4])  # rounding
-    for one in study["filter"]:
-        shown = rows_of(content.split("The same filter")[-1], f"{one['integration']}")
-        np.testing.assert_allclose(shown[2], one["bias_rms_deg_per_hour"], rtol=6e-4)
+    for row in study["filter"]:
+        shown = rows_of(content.split("The same filter")[-1], f"{row['integration']}")
+        np.testing.assert_allclose(shown[2], row["bias_rms_deg_per_hour"], rtol=6e-4)
     if headless.CHROMIUM is not None:  # names side by side where there is room, else aslant
         turned = DRAWN.replace(
             "{drawn}", "{turned: (({plot}) => plot.axes[0].rotate(plot))(strapdownCharts.drawn()[0])}"
@@ -338,7 +340,9 @@ def test_a_second_estimate_is_interpolated_by_rotation_at_constant_rate():
 
 def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
     findings = [SimpleNamespace(rejected=True, means="odd"), SimpleNamespace(rejected=False, means="even")]
-    verdicts = [SimpleNamespace(verdict=one, reason=one, findings=[]) for one in ("consistent", "cannot tell")]
+    verdicts = [
+        SimpleNamespace(verdict=verdict, reason=verdict, findings=[]) for verdict in ("consistent", "cannot tell")
+    ]
     verdicts[0].findings = findings
     after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
     comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
@@ -440,7 +444,7 @@ def test_passing_findings_are_called_pass_and_failing_ones_fail(folder):
             for kind, mark in re.findall(r'<td class="(pass|fail)">(\w+)</td></tr>', evidence)
             if kind == mark.lower()
         ]
-        assert marks == ["fail" if one["rejected"] else "pass" for one in judgement["findings"]]
+        assert marks == ["fail" if finding["rejected"] else "pass" for finding in judgement["findings"]]
         assert ("fail" in marks) == failing
 
 
@@ -462,8 +466,8 @@ def test_bad_input_is_refused_before_anything_is_written(folder, tmp_path):
 def test_a_folder_without_a_name_is_no_result(place):
     with pytest.raises(InputError, match="is a folder; name the file in it"):
         report.write(place)
-    found = CliRunner().invoke(cli.app, ["report", place])
-    assert isinstance(found.exception, InputError)
+    result = CliRunner().invoke(cli.app, ["report", place])
+    assert isinstance(result.exception, InputError)
 
 
 DRAWN = """const wait = setInterval(() => {
@@ -518,33 +522,33 @@ def shown_by_a_browser(page, width):
         pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
     charts = str('class="chart"' in body(page)).lower()
     dark = ("--blink-settings=preferredColorScheme=0", "--virtual-time-budget=20000")
-    found = headless.reported(page, PROBE.replace("PAGE_HAS_CHARTS", charts), width, *dark)
-    assert found["console"] == []
-    return found
+    reported = headless.reported(page, PROBE.replace("PAGE_HAS_CHARTS", charts), width, *dark)
+    assert reported["console"] == []
+    return reported
 
 
 @pytest.mark.parametrize(("name", "width"), [("right", 1280), ("campaign", 390)])
 def test_a_browser_shows_figures_and_charts(folder, name, width):
-    found = shown_by_a_browser(folder / f"{name}.html", width)
-    assert found["hidden"] == 0
-    assert found["images"] >= 1
-    assert found["overflow"] <= 0
-    assert found["tables"]
-    assert all(found["tables"])  # scrolled to its end, a table shows its last column
-    assert found["charts"] == (6 if name == "right" else 9)
-    assert (found["unnamed"], found["dead"]) == (0, 0)
-    assert found["contents"] >= 5
-    whole, zoomed = np.array(found["begin"]), np.array(found["zoomed"])
+    reported = shown_by_a_browser(folder / f"{name}.html", width)
+    assert reported["hidden"] == 0
+    assert reported["images"] >= 1
+    assert reported["overflow"] <= 0
+    assert reported["tables"]
+    assert all(reported["tables"])  # scrolled to its end, a table shows its last column
+    assert reported["charts"] == (6 if name == "right" else 9)
+    assert (reported["unnamed"], reported["dead"]) == (0, 0)
+    assert reported["contents"] >= 5
+    whole, zoomed = np.array(reported["begin"]), np.array(reported["zoomed"])
     np.testing.assert_allclose(np.ptp(zoomed[:, :2], axis=1), 0.25 * np.ptp(whole[1, :2]), rtol=0.02)  # all of them
-    assert found["visible"] == pytest.approx(0.25 * found["samples"], rel=0.05, abs=2)
-    np.testing.assert_allclose(found["reset"], whole)  # a double click on one chart restores all of them
-    assert found["focusable"] == [0, "button"]
-    assert found["pressed"] == "false"
-    assert found["ink"] == "#16181d"  # dark on paper, also in the dark theme
+    assert reported["visible"] == pytest.approx(0.25 * reported["samples"], rel=0.05, abs=2)
+    np.testing.assert_allclose(reported["reset"], whole)  # a double click on one chart restores all of them
+    assert reported["focusable"] == [0, "button"]
+    assert reported["pressed"] == "false"
+    assert reported["ink"] == "#16181d"  # dark on paper, also in the dark theme
     if name == "right":
-        assert found["samples"] == len(setup.read_estimate(folder / "right.h5").time)
-        assert found["body"] == [found["samples"] - 1]
-        assert found["turned"] == [0]
+        assert reported["samples"] == len(setup.read_estimate(folder / "right.h5").time)
+        assert reported["body"] == [reported["samples"] - 1]
+        assert reported["turned"] == [0]
 
 
 def rows_of(content, first):
@@ -569,14 +573,15 @@ def test_the_tables_of_the_estimates_page_are_those_of_the_terminal(folder):
 
 def test_the_estimates_table_of_sensors_leaves_out_what_the_gate_rejected(folder):
     estimate = setup.read_estimate(folder / "right.h5")
-    one = estimate.innovations["star 1"]
-    outlier = np.arange(len(one.time)) % 5 == 0
-    wild = np.where(outlier[:, None], 100.0 * one.innovation, one.innovation)
-    gated = dataclasses.replace(one, innovation=wild, weight=np.where(outlier, 0.0, 1.0))
-    given = dataclasses.replace(estimate, innovations={"star 1": gated}, skipped={"star 1": 3})
-    nis = np.mean(one.innovation[~outlier] ** 2 / one.variance[~outlier])
-    counts = f"{len(one.time)} measurements, {outlier.sum()} rejected by the gate, 3 more missing or outside the record"
-    assert f"star 1: {counts}, mean NIS per degree of freedom {nis:.3g}" in given.listing().notes
+    innovation = estimate.innovations["star 1"]
+    outlier = np.arange(len(innovation.time)) % 5 == 0
+    wild = np.where(outlier[:, None], 100.0 * innovation.innovation, innovation.innovation)
+    gated = dataclasses.replace(innovation, innovation=wild, weight=np.where(outlier, 0.0, 1.0))
+    gated_estimate = dataclasses.replace(estimate, innovations={"star 1": gated}, skipped={"star 1": 3})
+    nis = np.mean(innovation.innovation[~outlier] ** 2 / innovation.variance[~outlier])
+    number = len(innovation.time)
+    counts = f"{number} measurements, {outlier.sum()} rejected by the gate, 3 more missing or outside the record"
+    assert f"star 1: {counts}, mean NIS per degree of freedom {nis:.3g}" in gated_estimate.listing().notes
 
 
 def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monkeypatch):
@@ -585,14 +590,14 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
     for state, name in enumerate([f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]):
         size = np.pi / 648000.0  # an hour has as many seconds as a degree has arcseconds
         shown = rows_of(content.partition("Errors at")[2], name)
-        wanted = [one[-1, state] / size for one in (held.mean_error, held.rms_error, held.sigma)]
+        wanted = [statistic[-1, state] / size for statistic in (held.mean_error, held.rms_error, held.sigma)]
         quantiles = [held.error_quantile(q)[-1, state] / size for q in verdicts.QUANTILES]
         np.testing.assert_allclose(shown[-6:], [*wanted, *quantiles], rtol=6e-4)
     covered = held.covered[verdicts.judged_epochs(len(held.time) - 1)][:, :3].mean(axis=(0, 1))
     assert all(f"{100.0 * share:.2f} %" in content for share in covered)
     drawn, ellipses = [], []
     monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))
-    monkeypatch.setattr(plots, "covariance_ellipses", lambda *given: ellipses.append(given[:3]))
+    monkeypatch.setattr(plots, "covariance_ellipses", lambda *arguments: ellipses.append(arguments[:3]))
     report.write(folder / "campaign.h5", folder / "again.html")
     assert set(drawn) == {-1}
     far = np.abs(np.log(np.diag(held.mean_square_error[-1]) / np.diag(held.covariance[-1])))[3:].argmax()
@@ -605,4 +610,4 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
 @pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
 def test_no_panel_of_a_figure_is_empty(folder, panels, name):
     assert len(panels[name]) >= (2 if name == "campaign" else 4)  # each in two themes
-    assert all(all(one) for one in panels[name])
+    assert all(all(figure) for figure in panels[name])

@@ -56,11 +56,11 @@ def turned(start, rotation_vector=(0.0, 1.57, 0.0)):
 
 def anees(estimates, records_, rows, every):
     """NEES per state averaged over runs at the given rows, of the attitude and of all states (rows, 2)."""
-    found = []
+    nees = []
     for estimate, record in zip(estimates, records_, strict=True):
         e, P = errors(estimate, record.truth, every)[rows], estimate.covariance[rows]
-        found.append([consistency.nees(e[:, :3], P[:, :3, :3]) / 3.0, consistency.nees(e, P) / 6.0])
-    return np.mean(found, axis=0).T
+        nees.append([consistency.nees(e[:, :3], P[:, :3, :3]) / 3.0, consistency.nees(e, P) / 6.0])
+    return np.mean(nees, axis=0).T
 
 
 # ------------------------------------------------------------------------------------------------------------------------- the gate
@@ -75,7 +75,7 @@ def test_thresholds_are_the_quantiles_of_chi_squared():
 @pytest.mark.parametrize("kind", ["direction", "heading", "attitude"])
 def test_false_alarms_are_as_often_as_asked_for(kind):
     probability = 0.98
-    chosen = {
+    sensors = {
         "direction": scenario(rate=25.0).sensors,
         "heading": (
             VectorSensor(name="a", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-3, rate=25.0, kind="heading"),
@@ -83,7 +83,7 @@ def test_false_alarms_are_as_often_as_asked_for(kind):
         ),
         "attitude": (AttitudeSensor(name="a", sigma_across=1e-3, sigma_about=5e-3, rate=25.0),),
     }[kind]
-    record = simulate(scenario(duration=160.0, sensors=chosen), 2)
+    record = simulate(scenario(duration=160.0, sensors=sensors), 2)
     estimate = estimation.run(record, NOISE, started(record, 0), gate=Gate(probability=probability))
     used = estimate.innovations["a"].used
     low, high = binom.ppf([0.005, 0.995], len(used), 1.0 - probability)
@@ -112,26 +112,26 @@ def test_isolated_outliers_are_refused_and_start_no_recovery():
 
 def lost_runs(runs, recovery=10, every=50):
     """Runs that start anywhere at all, with an initial σ of half a degree."""
-    estimates, made = [], []
+    estimates, records_ = [], []
     for run in range(runs):
         record = simulate(scenario(), 3, run)
         lost, gate = lost_start(record, run), Gate(recovery=recovery)
-        made.append(record)
+        records_.append(record)
         estimates.append(estimation.run(record, NOISE, lost, gate=gate, every=every, full_covariance=True))
-    return estimates, made
+    return estimates, records_
 
 
 @pytest.mark.parametrize("runs", [60, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_filter_that_is_lost_recovers_within_its_number_and_is_consistent_afterwards(runs):
     recovery = 10
-    estimates, made = lost_runs(runs, recovery)
+    estimates, records_ = lost_runs(runs, recovery)
     for estimate in estimates:
         (event,) = recoveries(estimate)
         assert event.start <= 0.1 + 1e-9
         # Of two sensors at one time either may come to the number first; a chance agreement costs one measurement more.
         assert event.end <= 0.1 * (recovery + 2) + 1e-9
         assert event.value >= recovery
-    assert_inside(anees(estimates, made, [2, 4, 8], 50)[:, 0], 3, runs, 0.99)
+    assert_inside(anees(estimates, records_, [2, 4, 8], 50)[:, 0], 3, runs, 0.99)
 
 
 def stepped_bias(record, step, at):
@@ -144,24 +144,24 @@ def stepped_bias(record, step, at):
 
 def stepped_runs(runs, step, bias_sigma, duration=24.0, at=300, fixed=None):
     """Runs whose gyro bias jumps by ``step`` rad/s in any direction at edge ``at``, under the default gate."""
-    estimates, made = [], []
+    estimates, records_ = [], []
     for run in range(runs):
         draw = generator(5, run, "step").standard_normal(3)
         jump = step * draw / np.linalg.norm(draw) if fixed is None else fixed
         record = stepped_bias(simulate(scenario(duration=duration), 4, run), jump, at)
         start = started(record, run, attitude_sigma=2e-3, bias_sigma=bias_sigma)
-        made.append(record)
+        records_.append(record)
         estimates.append(estimation.run(record, NOISE, start, gate=Gate(), every=5, full_covariance=True))
-    return estimates, made
+    return estimates, records_
 
 
-def whole_nees(estimates, made, after, every=5):
+def whole_nees(estimates, records_, after, every=5):
     """NEES per state, averaged over runs, so many seconds after the last recovery (len(after),)."""
-    found = []
-    for estimate, record in zip(estimates, made, strict=True):
+    nees = []
+    for estimate, record in zip(estimates, records_, strict=True):
         rows = np.searchsorted(estimate.time, recoveries(estimate)[-1].end + np.array(after))
-        found.append(consistency.nees(errors(estimate, record.truth, every)[rows], estimate.covariance[rows]) / 6.0)
-    return np.mean(found, axis=0)
+        nees.append(consistency.nees(errors(estimate, record.truth, every)[rows], estimate.covariance[rows]) / 6.0)
+    return np.mean(nees, axis=0)
 
 
 @pytest.mark.parametrize(
@@ -174,8 +174,8 @@ def test_a_default_gate_follows_bias_steps_of_any_size(runs, step, bias_sigma, m
     It takes over because its innovations agree, which favours the lucky: over 200 runs NEES per state is up to 1.2 after 2 s, and inside
     its bounds after 5 s. A step of 3σ may be followed without a recovery, once in 200 runs.
     """
-    estimates, made = stepped_runs(runs, step, bias_sigma)
-    pairs = [(estimate, record) for estimate, record in zip(estimates, made, strict=True) if recoveries(estimate)]
+    estimates, records_ = stepped_runs(runs, step, bias_sigma)
+    pairs = [(estimate, record) for estimate, record in zip(estimates, records_, strict=True) if recoveries(estimate)]
     assert len(pairs) >= (runs if step / bias_sigma >= 20.0 else 0.98 * runs)
     for estimate, _ in pairs:
         assert len(recoveries(estimate)) <= most
@@ -245,7 +245,7 @@ def judged(outcomes, recovery=3, limit=4):
     """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts, recoveries and lock-outs."""
     memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.COUNTERS))
     counters[:, gate_rules.REPORTED] = -1.0
-    lock_outs, count, found = np.zeros((9, 4)), 0, []
+    lock_outs, count, verdicts = np.zeros((9, 4)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):
         count, begins = gate_rules.judge_filter(
             mine, float(k), sensor, recovery, limit, counters, memory, lock_outs, count
@@ -253,8 +253,8 @@ def judged(outcomes, recovery=3, limit=4):
         if begins:
             gate_rules.reset_candidate(memory, float(k), np.zeros(3), np.ones(3))
         if memory[gate_rules.CANDIDATE]:
-            found.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, counters, memory, np.zeros(3)))
-    return memory, counters, lock_outs[:count], found
+            verdicts.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, counters, memory, np.zeros(3)))
+    return memory, counters, lock_outs[:count], verdicts
 
 
 def test_the_rules_of_a_gate():
@@ -267,20 +267,20 @@ def test_the_rules_of_a_gate():
         followed,
     ]  # of which the other sensor is none refused
     assert judged([refused, (1, ACCEPTED, ACCEPTED)])[0][gate_rules.HITS] == 1.0  # what the filter accepts too is none
-    memory, counters, lock_outs, found = judged([refused, both, both])
-    assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
+    memory, counters, lock_outs, verdicts = judged([refused, both, both])
+    assert verdicts == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
     assert (memory[gate_rules.LEVEL], memory[gate_rules.CANDIDATE]) == (1.0, 0.0)
     assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
     assert judged([refused] * 6 + [both] * 2 + [refused, both])[3][-1] == followed
     assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
     memory, counters, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
     assert not gate_rules.takes_over(0, 3, counters, memory)
-    memory, counters, lock_outs, found = judged([(1, ACCEPTED, None)] * 15 + [refused, both, both, refused])
+    memory, counters, lock_outs, verdicts = judged([(1, ACCEPTED, None)] * 15 + [refused, both, both, refused])
     assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
         memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
         assert memory[gate_rules.LEVEL] == level
-    memory, counters, lock_outs, found = judged([refused] * 6)
+    memory, counters, lock_outs, verdicts = judged([refused] * 6)
     assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
     assert gate_rules.takes_over(0, 3, counters, memory)
     assert not gate_rules.takes_over(1, 3, counters, memory)
@@ -331,10 +331,10 @@ def test_a_refused_update_that_does_not_converge_is_reported_at_the_prior(kind, 
         expected, variance = [z[0] ** 2 / (wide + 0.01), (z[2] - 1.0) ** 2 / 0.01], [0.01, wide + 0.01, wide + 0.01]
     series = VectorMeasurements(sensor="s", kind=kind, time=[0.0], vector_b=[z], reference_f=r, sigma=0.1)
     record = records.ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
-    found = estimation.run(record, NOISE, replace(start, gate=memory), gate=Gate()).innovations["s"]
-    assert found.weight[0] == 0.0
-    np.testing.assert_allclose(np.sort(found.variance[0]), variance, rtol=1e-12)
-    np.testing.assert_allclose(found.nis[0], sum(expected), rtol=1e-12)
+    innovation = estimation.run(record, NOISE, replace(start, gate=memory), gate=Gate()).innovations["s"]
+    assert innovation.weight[0] == 0.0
+    np.testing.assert_allclose(np.sort(innovation.variance[0]), variance, rtol=1e-12)
+    np.testing.assert_allclose(innovation.nis[0], sum(expected), rtol=1e-12)
 
 
 def test_a_widened_candidate_is_one_that_started_wider():
@@ -344,8 +344,8 @@ def test_a_widened_candidate_is_one_that_started_wider():
     for _ in range(20):
         variance = rng.uniform(0.5, 2.0, 3)
         root = rng.standard_normal((6, 6))
-        seen = root @ root.T
-        P = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / variance)]))
+        information = root @ root.T
+        P = np.linalg.inv(information + np.diag([0.0, 0.0, 0.0, *(1.0 / variance)]))
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
         x, matrices = np.zeros((2, 7)), np.zeros((2, 6, kernels.W))
         x[1], matrices[1, :, :6] = [1.0, 0.0, 0.0, 0.0, *bias], P
@@ -353,8 +353,8 @@ def test_a_widened_candidate_is_one_that_started_wider():
         memory = np.zeros(gate_rules.MEMORY)
         memory[gate_rules.FIRST_BIAS :] = [*(bias + first), *variance]
         kernels.widen(form, memory)
-        expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
-        # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
+        expected = np.linalg.inv(information + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
+        # The mean solves P⁻¹ x = information x̂ + start, of which the start's part shrinks too.
         mean = -expected[:, 3:] @ (8.0 / 9.0 / variance * first)
         assert np.allclose(matrices[1, :, :6], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
         assert np.allclose(x[1, 4:7] - bias, mean[3:], rtol=1e-6, atol=1e-14)
@@ -419,8 +419,8 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
     """The turn about it stays uniform, whatever comes; NEES per state used to be 4.1 on the mean and its σ to fall to 25°."""
     nees, turns = [], []
     for run in range(runs):
-        one = replace(scenario(duration=16.0), sensors=scenario().sensors[:1])
-        record = simulate(one, 31, run)
+        one_star = replace(scenario(duration=16.0), sensors=scenario().sensors[:1])
+        record = simulate(one_star, 31, run)
         estimate = estimation.run(record, NOISE, lost_start(record, run), gate=Gate(), every=50, full_covariance=True)
         assert len(recoveries(estimate)) == 1
         error, n = turn_and_tilt(estimate, record, STARS[0], 50)
@@ -434,20 +434,20 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
 @pytest.mark.parametrize("runs", [40, pytest.param(400, marks=pytest.mark.slow)])
 def test_after_a_recovery_on_one_direction_a_second_one_measures_the_turn(runs, bias_sigma):
     """NEES per state used to be 4 and 18 after it: what ties tilt and bias together does not turn about the first direction."""
-    estimates, made = [], []
+    estimates, records_ = [], []
     for run in range(runs):
         a, b = scenario().sensors
-        chosen = replace(
+        interrupted = replace(
             scenario(duration=10.0),
             motion=motion.Coning(angle=0.3, frequency=0.1),
             sensors=(a, replace(b, faults=Faults(outages=((0.0, 6.0),)))),
         )
-        record = simulate(chosen, 31, run)
+        record = simulate(interrupted, 31, run)
         lost = lost_start(record, run, bias_sigma)
-        made.append(record)
+        records_.append(record)
         estimates.append(estimation.run(record, NOISE, lost, gate=Gate(), every=25, full_covariance=True))
         assert len(recoveries(estimates[-1])) == 1
-    assert_inside(anees(estimates, made, [13, 14, 20], 25)[:, 1], 6, runs, 0.999)
+    assert_inside(anees(estimates, records_, [13, 14, 20], 25)[:, 1], 6, runs, 0.999)
 
 
 def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
@@ -496,8 +496,8 @@ def contaminated(runs, faults, duration=16.0):
     for run in range(runs):
         record = simulate(scenario(faults, duration=duration), 9, run)
         start = started(record, run)
-        for name, given in TREATMENTS.items():
-            estimate = estimation.run(record, NOISE, start, every=50, full_covariance=True, **given)
+        for name, treatment in TREATMENTS.items():
+            estimate = estimation.run(record, NOISE, start, every=50, full_covariance=True, **treatment)
             e = errors(estimate, record.truth, 50)[8:, :3]
             squares[name] += np.mean(e**2) / runs
             consistent[name] += np.mean(consistency.nees(e, estimate.covariance[8:, :3, :3])) / 3.0 / runs
@@ -585,11 +585,11 @@ def test_the_smoother_leaves_out_what_the_filter_refused():
         replace(s, vector_b=np.where(gated.innovations[s.sensor].used[:, None], s.vector_b, np.nan))
         for s in record.vectors
     )
-    one = estimation.smooth(record, NOISE, start, gate=Gate(), full_covariance=True)
+    smoothed = estimation.smooth(record, NOISE, start, gate=Gate(), full_covariance=True)
     other = estimation.smooth(replace(record, vectors=cleaned), NOISE, start, full_covariance=True)
     assert gated.refused["a"] > 3
-    assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
-    assert np.allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-16)
+    assert np.allclose(smoothed.attitude, other.attitude, rtol=0.0, atol=1e-12)
+    assert np.allclose(smoothed.covariance, other.covariance, rtol=1e-7, atol=1e-16)
 
 
 def test_robust_smoothing_is_better_and_consistent():
@@ -622,11 +622,11 @@ def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
     missing[7] = np.nan
     start = started(record, 0)
     gate = Gate(probability=1.0 - 1e-9)
-    one = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
+    estimate = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
     other = estimation.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
-    assert np.array_equal(one.attitude, other.attitude)
-    assert np.array_equal(one.variance, other.variance)
-    assert one.refused == {"a": 1, "b": 0}
+    assert np.array_equal(estimate.attitude, other.attitude)
+    assert np.array_equal(estimate.variance, other.variance)
+    assert estimate.refused == {"a": 1, "b": 0}
     assert other.skipped == {"a": 1, "b": 0}
 
 

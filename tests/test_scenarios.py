@@ -182,8 +182,8 @@ def test_adding_a_sensor_changes_no_other_stream():
     for a, b in zip(alone.vectors, more.vectors[:2], strict=True):
         assert np.array_equal(a.vector_b, b.vector_b)
     twins = tuple(dataclasses.replace(SENSORS[1], name=name) for name in ("one", "other"))
-    one, other = scenarios.simulate(dataclasses.replace(base, sensors=twins), 3, 7).vectors
-    assert not np.any(one.vector_b == other.vector_b)
+    first, other = scenarios.simulate(dataclasses.replace(base, sensors=twins), 3, 7).vectors
+    assert not np.any(first.vector_b == other.vector_b)
     with pytest.raises(InputError, match="two sensors"):
         dataclasses.replace(base, sensors=(SENSORS[0], SENSORS[0]))
 
@@ -286,12 +286,12 @@ sigma_about_arcsec = 30.0
 rate_hz = 2.0
 boresight = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
 """
-    found = scenario_from_toml(text)
-    np.testing.assert_allclose(found.gyro.scale_factor, [200e-6] * 3, rtol=1e-15)
-    np.testing.assert_allclose(found.sensors[0].boresight, [0.6, 0.0, 0.8])
-    again = scenario_from_toml(scenario_to_toml(found))
-    assert again.sensors == found.sensors
-    np.testing.assert_array_equal(again.gyro.scale_factor, found.gyro.scale_factor)
+    scenario = scenario_from_toml(text)
+    np.testing.assert_allclose(scenario.gyro.scale_factor, [200e-6] * 3, rtol=1e-15)
+    np.testing.assert_allclose(scenario.sensors[0].boresight, [0.6, 0.0, 0.8])
+    again = scenario_from_toml(scenario_to_toml(scenario))
+    assert again.sensors == scenario.sensors
+    np.testing.assert_array_equal(again.gyro.scale_factor, scenario.gyro.scale_factor)
 
 
 def test_a_duty_cycle_and_lost_samples_leave_the_rest_as_it_was():

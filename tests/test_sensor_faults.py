@@ -36,15 +36,15 @@ def swing(duration: float = 40.0) -> Recording:
     rate = (later(-h).inv() * later(h)).as_rotvec() / (2.0 * h)
     random = np.random.default_rng(3)
 
-    def seen(fixed: list[float], noise: float) -> np.ndarray:
+    def measured(fixed: list[float], noise: float) -> np.ndarray:
         return attitude.inv().apply(fixed) + noise * random.standard_normal((len(time), 3))
 
     return Recording(
         source="swing",
         time=time,
         rate=rate + 2e-3 * random.standard_normal(rate.shape),
-        specific_force=seen([0.0, 0.0, 9.81], 0.05),
-        magnetic_field=seen([0.0, 20.0, -45.0], 0.3),
+        specific_force=measured([0.0, 0.0, 9.81], 0.05),
+        magnetic_field=measured([0.0, 20.0, -45.0], 0.3),
         true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
     )
 
@@ -65,8 +65,8 @@ def test_samples_at_the_limit_are_recognised():
 def test_a_quantised_sensor_that_repeats_samples_at_rest_may_be_clipped():
     moving = np.round(swing().rate, 2)
     plain = np.concatenate([np.zeros((4000, 3)), moving])
-    found = sensor_faults.clipped_samples(np.clip(plain, -5.0, 5.0), 1.0)
-    np.testing.assert_array_equal(found, np.abs(plain) >= 5.0)
+    clipped = sensor_faults.clipped_samples(np.clip(plain, -5.0, 5.0), 1.0)
+    np.testing.assert_array_equal(clipped, np.abs(plain) >= 5.0)
 
 
 def test_rows_of_nan_or_of_zeros_are_no_samples():
@@ -136,9 +136,9 @@ def test_only_the_turn_about_the_clipped_axis_is_uncertain():
     plain = swing()
     sigma = []
     for recording in (plain, with_rate(plain, 5.0)):
-        found = ahrs.estimate(recording, latency=0.0)
-        sigma.append(np.sqrt(found.estimate.variance[:, :3]))
-    run = np.flatnonzero(found.faults.turn_variance[:, 0])
+        ahrs_estimate = ahrs.estimate(recording, latency=0.0)
+        sigma.append(np.sqrt(ahrs_estimate.estimate.variance[:, :3]))
+    run = np.flatnonzero(ahrs_estimate.faults.turn_variance[:, 0])
     ratio = (sigma[1] / sigma[0])[run[run > 5.0 * RATE] + 1]
     assert np.median(ratio[:, 0]) > 1.5
     assert np.all(np.abs(np.median(ratio[:, 1:], axis=0) - 1.0) < 0.1)
@@ -164,20 +164,22 @@ def test_the_turn_over_a_gap_is_that_of_a_brownian_bridge():
 
 def off_by(recording: Recording, **options: bool) -> tuple[np.ndarray, np.ndarray, ahrs.AhrsEstimate]:
     """Errors of the attitude, rad, and NEES of it, from 3 s on."""
-    found = ahrs.estimate(recording, latency=0.0, full_covariance=True, **options)
-    used, q = found.recording, found.estimate.attitude
+    ahrs_estimate = ahrs.estimate(recording, latency=0.0, full_covariance=True, **options)
+    used, q = ahrs_estimate.recording, ahrs_estimate.estimate.attitude
     error = quaternion.log(quaternion.multiply(quaternion.conjugate(q), used.true_attitude))
-    nees = np.einsum("ki,ki->k", error, np.linalg.solve(found.estimate.covariance[:, :3, :3], error[..., None])[..., 0])
+    nees = np.einsum(
+        "ki,ki->k", error, np.linalg.solve(ahrs_estimate.estimate.covariance[:, :3, :3], error[..., None])[..., 0]
+    )
     late = used.time > 3.0
-    return np.linalg.norm(error, axis=1)[late], nees[late], found
+    return np.linalg.norm(error, axis=1)[late], nees[late], ahrs_estimate
 
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_sigma_holds_where_the_gyro_was_clipped(smooth, monkeypatch):
     clipped = with_rate(swing(), 5.0)
-    error, nees, found = off_by(clipped, smooth=smooth)
+    error, nees, ahrs_estimate = off_by(clipped, smooth=smooth)
     assert np.mean(nees < 7.81) > 0.9
-    assert "The gyro was clipped: x at 286.5 °/s" in found.faults.words[0]
+    assert "The gyro was clipped: x at 286.5 °/s" in ahrs_estimate.faults.words[0]
     assert np.sqrt(np.mean(error**2)) < 15.0 * DEGREE
     # taken as it is
     monkeypatch.setattr(sensor_faults, "MIN_CLIPPED_RATE", 100.0)
@@ -193,11 +195,11 @@ def test_sigma_grows_over_a_dropout():
         kept[round(begin * RATE) : round((begin + 0.2) * RATE)] = False
     names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude")
     broken = dataclasses.replace(plain, **{name: getattr(plain, name)[kept] for name in names})
-    _, nees, found = off_by(broken)
-    assert "Intervals between stamps longer than 1.5 median ones: 3, up to 0.205 s" in found.faults.words[0]
+    _, nees, ahrs_estimate = off_by(broken)
+    assert "Intervals between stamps longer than 1.5 median ones: 3, up to 0.205 s" in ahrs_estimate.faults.words[0]
     assert np.mean(nees < 7.81) > 0.9
-    sigma = np.sqrt(found.estimate.variance[:, :3].sum(axis=1))
-    row = int(np.searchsorted(found.recording.time, 20.1))
+    sigma = np.sqrt(ahrs_estimate.estimate.variance[:, :3].sum(axis=1))
+    row = int(np.searchsorted(ahrs_estimate.recording.time, 20.1))
     assert sigma[row + 10] > 1.5 * sigma[row - 20]
 
 
@@ -230,11 +232,11 @@ def test_zeros_at_rest_are_no_sign_of_truncation(rounding, truncated):
 def test_a_truncated_gyro_shows_the_same_bias_at_rest_and_in_motion():
     truncated, rate = quantised(np.trunc)
     assert sensor_faults.truncation_step(truncated.rate) == pytest.approx(LSB, rel=1e-3)
-    found = sensor_faults.find(truncated)
-    assert "multiples of 0.0573 °/s truncated toward zero" in found.words[0]
+    faults = sensor_faults.find(truncated)
+    assert "multiples of 0.0573 °/s truncated toward zero" in faults.words[0]
     resting = truncated.time < 2.0
     for samples in (resting, ~resting):
-        assert np.abs(np.mean((found.recording.rate - rate)[samples], axis=0)).max() < 0.1 * LSB
+        assert np.abs(np.mean((faults.recording.rate - rate)[samples], axis=0)).max() < 0.1 * LSB
     assert np.abs(np.mean((truncated.rate - rate)[resting], axis=0)).max() > 0.3 * LSB
 
 
@@ -257,14 +259,14 @@ def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
     broken = filled(plain, *spans)
     rows = np.rint(RATE * np.array(spans)).astype(int)
     assert sensor_faults.interpolated(broken.rate) == [tuple(span) for span in rows.tolist()]
-    _, nees, found = off_by(broken, smooth=smooth)
-    assert "Gaps filled by interpolation: 3, up to 1.9 s" in found.faults.words[0]
+    _, nees, ahrs_estimate = off_by(broken, smooth=smooth)
+    assert "Gaps filled by interpolation: 3, up to 1.9 s" in ahrs_estimate.faults.words[0]
     gap = np.concatenate([np.arange(first + 1, last) for first, last in rows])
-    for samples in (found.recording.specific_force, found.recording.magnetic_field):
+    for samples in (ahrs_estimate.recording.specific_force, ahrs_estimate.recording.magnetic_field):
         np.testing.assert_array_equal(np.flatnonzero(~sampled(samples)), gap)
     assert np.mean(nees < 7.81) > 0.9
-    assert not np.intersect1d(found.rests.last, gap).size
-    assert np.abs(found.estimate.bias[-1]).max() < 0.5 * DEGREE
+    assert not np.intersect1d(ahrs_estimate.rests.last, gap).size
+    assert np.abs(ahrs_estimate.estimate.bias[-1]).max() < 0.5 * DEGREE
 
 
 def test_the_turn_over_a_long_gap_has_a_variance_of_one():
@@ -285,16 +287,16 @@ def test_a_clipped_accelerometer_is_left_out():
     plain = swing()
     force = plain.specific_force + 30.0 * np.sin(40.0 * plain.time)[:, None] * (plain.time > 5.0)[:, None]
     clipped = np.clip(force, -19.6, 19.6)
-    found = sensor_faults.find(dataclasses.replace(plain, specific_force=clipped))
+    faults = sensor_faults.find(dataclasses.replace(plain, specific_force=clipped))
     lost = np.any(np.abs(force) >= 19.6, axis=1)
-    np.testing.assert_array_equal(np.isnan(found.recording.specific_force).all(axis=1), lost)
-    assert f"clipped in {np.sum(lost)} samples" in found.words[0]
+    np.testing.assert_array_equal(np.isnan(faults.recording.specific_force).all(axis=1), lost)
+    assert f"clipped in {np.sum(lost)} samples" in faults.words[0]
 
 
 def test_an_ordinary_recording_has_no_faults():
-    found = sensor_faults.find(swing(10.0))
-    assert found.words == ()
-    assert not found.turn_variance.any()
+    faults = sensor_faults.find(swing(10.0))
+    assert faults.words == ()
+    assert not faults.turn_variance.any()
 
 
 @pytest.mark.parametrize(
@@ -315,14 +317,14 @@ def test_a_stuck_gyro_is_reported(rows, axes, value, words):
     rng = np.random.default_rng(1)
     rate, force = rng.normal(0.0, 0.5, (1000, 3)), rng.normal([0.0, 0.0, 9.8], 2.0, (1000, 3))
     rate[rows, axes] = value
-    one = Recording(source="a", time=0.01 * np.arange(1000), rate=rate, specific_force=force)
-    said = sensor_faults.stuck_words(one)
+    recording = Recording(source="a", time=0.01 * np.arange(1000), rate=rate, specific_force=force)
+    said = sensor_faults.stuck_words(recording)
     assert (words in said[0]) if words else not said
     if words:
-        examined = check_conventions.examine(one)
+        examined = check_conventions.examine(recording)
         assert said[0] in examined.warnings
         assert examined.verdict == "cannot tell"
-    at_rest = dataclasses.replace(one, specific_force=np.tile([0.0, 0.0, 9.8], (1000, 1)))
+    at_rest = dataclasses.replace(recording, specific_force=np.tile([0.0, 0.0, 9.8], (1000, 1)))
     assert bool(sensor_faults.stuck_words(at_rest)) == (axes == 1 and words != "")
 
 
@@ -351,6 +353,6 @@ def test_the_compiled_statistics_are_those_of_numpy():
     samples[np.random.default_rng(3).random(600) < 0.2] = np.nan
     ends = np.empty((3, 2, 2))
     compiled(recording_samples.extremes)(read_only(samples), ends)
-    for column, found in zip(samples.T, ends, strict=True):
+    for column, counted in zip(samples.T, ends, strict=True):
         extremes = [np.nanmax(column), np.nanmin(column)]
-        assert found.tolist() == [[end, np.sum(column == end)] for end in extremes]
+        assert counted.tolist() == [[end, np.sum(column == end)] for end in extremes]

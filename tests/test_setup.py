@@ -26,8 +26,8 @@ SETUP = FilterSetup(
 
 
 def scenario(**changes):
-    chosen = scenarios.load_scenario("coning")
-    return dataclasses.replace(chosen, **changes)
+    base = scenarios.load_scenario("coning")
+    return dataclasses.replace(base, **changes)
 
 
 @pytest.mark.parametrize(
@@ -82,9 +82,9 @@ def test_a_file_without_the_table_says_what_writes_one(tmp_path):
 def test_matched_takes_the_gyro_at_its_word():
     """A Gauss–Markov bias starts from its stationary spread."""
     spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
-    chosen = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False)
-    assert chosen.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
-    assert chosen.bias_sigma == pytest.approx(3e-5)
+    filter_setup = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False)
+    assert filter_setup.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
+    assert filter_setup.bias_sigma == pytest.approx(3e-5)
     spec = GyroSpec(angle_random_walk=2e-5, markov_noise=1e-6, markov_correlation_time=800.0)
     assert setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False).bias_sigma == pytest.approx(
         1e-6 * np.sqrt(400.0)
@@ -123,8 +123,8 @@ def test_measurement_density_counts_what_each_kind_measures():
     whole = np.tile(quaternion.IDENTITY, (4, 1))
     tracker = VectorMeasurements(sensor="c", kind="attitude", time=time, attitude=whole, sigma_axes=[0.1, 0.2, 0.4])
     for series, information in ((compass, 100.0), (field, 200.0), (tracker, 100.0 + 25.0 + 6.25)):
-        one = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
-        assert setup.matching.measurement_density(one) == pytest.approx(8.0 / (4.0 * information / 3.0))
+        single = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
+        assert setup.matching.measurement_density(single) == pytest.approx(8.0 / (4.0 * information / 3.0))
 
 
 def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
@@ -132,24 +132,24 @@ def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
     first, *rest = record.vectors
     uneven = dataclasses.replace(first, sigma=np.linspace(1.0, 2.0, len(first.time)) * 1e-3)
     record = dataclasses.replace(record, vectors=(uneven, *rest))
-    one = dataclasses.replace(SETUP, sigma={first.sensor: 5e-4}, measurement_sigma_factor=1.0)
-    taken = setup.modelled_record(record, one).vectors
+    filter_setup = dataclasses.replace(SETUP, sigma={first.sensor: 5e-4}, measurement_sigma_factor=1.0)
+    taken = setup.modelled_record(record, filter_setup).vectors
     assert np.sqrt(np.mean(taken[0].sigma ** 2)) == pytest.approx(5e-4)
     np.testing.assert_allclose(taken[0].sigma / taken[0].sigma[0], uneven.sigma / uneven.sigma[0])
     assert taken[1] is rest[0]
     with pytest.raises(InputError, match="star 1"):
-        setup.modelled_record(record, dataclasses.replace(one, sigma={"star one": 1e-3}))
+        setup.modelled_record(record, dataclasses.replace(filter_setup, sigma={"star one": 1e-3}))
 
 
 def test_the_matched_filter_of_a_scenario_is_consistent():
     # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
     noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
-    chosen = scenario(gyro=noise, gyro_preset="", duration=30.0)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
+    noise_only = scenario(gyro=noise, gyro_preset="", duration=30.0)
+    filter_setup = setup.FilterSetup.for_scenario(noise_only, states=False)
     filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS["four-sample"])
     runs, last = 60, []
     for run in range(runs):
-        record = scenarios.simulate(chosen, 11, run)
+        record = scenarios.simulate(noise_only, 11, run)
         start = montecarlo.start(record, filter_setup, 11, run)
         estimate = setup.run(record, filter_setup, start, full_covariance=True)
         last.append(consistency.nees(errors_at(estimate, record.truth, -1), estimate.covariance[-1]))
@@ -187,11 +187,12 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
 
 def test_with_states_there_is_less_that_is_not_covered():
     for name in ("spin", "low-orbit", "coning", "tumbling-satellite"):
-        chosen = scenarios.load_scenario(name)
-        filter_setup = setup.FilterSetup.for_scenario(chosen, states=True)
-        assert setup.unmodelled_errors(chosen.gyro, chosen.sensors)
+        scenario = scenarios.load_scenario(name)
+        filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+        assert setup.unmodelled_errors(scenario.gyro, scenario.sensors)
         assert (
-            setup.unmodelled_errors(chosen.gyro, chosen.sensors, filter_setup.states, gravity_f=chosen.gravity_f) == ()
+            setup.unmodelled_errors(scenario.gyro, scenario.sensors, filter_setup.states, gravity_f=scenario.gravity_f)
+            == ()
         )
     held = scenarios.load_scenario("hand-held")
     part = setup.FilterSetup.for_scenario(held, states=True).states.select(("gyro.drift", "accelerometer.lever"))
@@ -202,9 +203,9 @@ def test_with_states_there_is_less_that_is_not_covered():
 
 
 def test_an_estimate_of_a_setup_with_states_holds_them():
-    chosen = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=True)
-    record = scenarios.simulate(chosen)
+    scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+    record = scenarios.simulate(scenario)
     start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
     estimate = setup.run(record, filter_setup, start, every=10, full_covariance=True)
     assert estimate.covariance.shape == (301, 6, 6)
@@ -215,20 +216,20 @@ def test_an_estimate_of_a_setup_with_states_holds_them():
 
 @pytest.mark.parametrize("states", [False, True])
 def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
-    chosen = dataclasses.replace(scenarios.load_scenario("spin" if states else "coning"), duration=10.0)
-    record = scenarios.simulate(chosen, 3)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=states)
+    scenario = dataclasses.replace(scenarios.load_scenario("spin" if states else "coning"), duration=10.0)
+    record = scenarios.simulate(scenario, 3)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=states)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
-    found = setup.smooth(record, filter_setup, start, full_covariance=True)
+    smoothed = setup.smooth(record, filter_setup, start, full_covariance=True)
     modelled = setup.modelled_record(record, filter_setup)
     kinds = {series.sensor: series.kind for series in modelled.vectors}
     blocks = filter_setup.states.blocks(kinds) if states else ()
     same = estimation.smooth(modelled, filter_setup.process_noise, start, blocks, full_covariance=True)
-    assert list(found.error_states or ()) == [block.name for block in blocks]
-    np.testing.assert_array_equal(found.attitude, same.attitude)
-    np.testing.assert_array_equal(found.covariance, same.covariance)
+    assert list(smoothed.error_states or ()) == [block.name for block in blocks]
+    np.testing.assert_array_equal(smoothed.attitude, same.attitude)
+    np.testing.assert_array_equal(smoothed.covariance, same.covariance)
     plain = setup.run(record, filter_setup, start)
-    assert np.all(found.variance <= plain.variance * (1.0 + 1e-9))
+    assert np.all(smoothed.variance <= plain.variance * (1.0 + 1e-9))
 
 
 @pytest.mark.parametrize("smooth", [False, True])
@@ -236,30 +237,32 @@ def test_a_record_is_modelled_once_also_if_the_filter_starts_late(smooth, monkey
     """Initial state and filter have the same increments and σ: an algorithm with samples before its step uses those before the start, and a
     varying σ is scaled by its mean over the whole record."""
     record = scenarios.simulate(scenarios.load_scenario("magnetometer-only"), 3)
-    chosen = dataclasses.replace(
+    filter_setup = dataclasses.replace(
         FilterSetup.for_record(record, states=False),
         integration=coning.ALGORITHMS["matched-4-11"],
         sigma={"magnetometer": 0.02},
     )
-    modelled = setup.modelled_record(record, chosen)
+    modelled = setup.modelled_record(record, filter_setup)
     calls = []
-    monkeypatch.setattr(setup.running, "compress", lambda *given: calls.append(given) or records.compress(*given))
-    found = workflows.estimating.run(record, setup=chosen, smooth=smooth)
+    monkeypatch.setattr(
+        setup.running, "compress", lambda *arguments: calls.append(arguments) or records.compress(*arguments)
+    )
+    result = workflows.estimating.run(record, setup=filter_setup, smooth=smooth)
     assert len(calls) == 1
-    first = len(modelled.increments) - len(found.record.increments)
+    first = len(modelled.increments) - len(result.record.increments)
     assert first > 0
     rest = records.cut(modelled, first, len(modelled.increments))
     work = estimation.smooth if smooth else estimation.run
-    same = work(rest, chosen.process_noise, found.initial, full_covariance=True)
-    np.testing.assert_array_equal(found.estimate.attitude, same.attitude)
-    np.testing.assert_array_equal(found.estimate.covariance, same.covariance)
-    np.testing.assert_array_equal(found.record.increments, rest.increments)
+    same = work(rest, filter_setup.process_noise, result.initial, full_covariance=True)
+    np.testing.assert_array_equal(result.estimate.attitude, same.attitude)
+    np.testing.assert_array_equal(result.estimate.covariance, same.covariance)
+    np.testing.assert_array_equal(result.record.increments, rest.increments)
 
 
 def test_what_cannot_be_smoothed_is_refused(monkeypatch):
-    chosen = scenario(duration=10.0)
-    record = scenarios.simulate(chosen, 3)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
+    brief = scenario(duration=10.0)
+    record = scenarios.simulate(brief, 3)
+    filter_setup = setup.FilterSetup.for_scenario(brief, states=False)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     monkeypatch.setattr(setup.running, "MAX_MEMORY", 1e5)
     with pytest.raises(InputError, match=r"with 6 states needs .* GB, more than 0.0001; cut the record"):

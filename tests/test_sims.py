@@ -98,9 +98,9 @@ def test_own_best_loses_nowhere(result):
 
 
 def test_own_best_leads_on_random_manoeuvres():
-    found = sim.manoeuvres(3, 1)
-    errors = found.errors
-    least = [min(errors[name][k] for name in sim.PUBLISHED) for k in range(len(found.ratios))]
+    manoeuvres = sim.manoeuvres(3, 1)
+    errors = manoeuvres.errors
+    least = [min(errors[name][k] for name in sim.PUBLISHED) for k in range(len(manoeuvres.ratios))]
     assert all(
         own < max(best, sim.MANOEUVRE_ROUNDING) for own, best in zip(errors["matched-1-8-8"], least, strict=True)
     )

@@ -8,7 +8,7 @@ import filterpy.kalman
 import mpmath
 import numpy as np
 import pytest
-from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit, waves
+from measured import assert_inside, drawn_start, errors, in_body, recoveries, series_of, unit, waves
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -46,14 +46,14 @@ class Case:
 
 def exact(name, kind, time, reference, sigma, attitude=quaternion.IDENTITY) -> VectorMeasurements:
     """A sensor without errors that is modelled with some."""
-    z = np.broadcast_to(seen(attitude, reference), (len(time), 3))
+    z = np.broadcast_to(in_body(attitude, reference), (len(time), 3))
     return series_of(name, kind, time, z, reference, sigma)
 
 
 def measure(name, kind, reference, sigma, time, attitude, rng) -> VectorMeasurements:
-    one = exact(name, kind, time, reference, sigma, attitude)
-    z = one.vector_b + sigma * rng.standard_normal((len(time), 3))
-    return dataclasses.replace(one, vector_b=z if kind == "vector" else unit(z))
+    series = exact(name, kind, time, reference, sigma, attitude)
+    z = series.vector_b + sigma * rng.standard_normal((len(time), 3))
+    return dataclasses.replace(series, vector_b=z if kind == "vector" else unit(z))
 
 
 def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = None) -> ImuRecord:
@@ -219,12 +219,12 @@ def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: estimat
     )
 
 
-def assert_same(one: Estimate, other: Estimate, tolerance: float) -> None:
+def assert_same(estimate: Estimate, other: Estimate, tolerance: float) -> None:
     """Difference of the states in units of their σ, and of the covariances scaled to correlations, within the tolerance."""
-    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
-    assert np.max(np.abs(error) / one.sigma) < tolerance
-    scale = one.sigma[:, :, None] * one.sigma[:, None, :]
-    assert np.max(np.abs(one.covariance - other.covariance) / scale) < tolerance
+    error = consistency.errors(estimate.attitude, estimate.bias, other.attitude, other.bias)
+    assert np.max(np.abs(error) / estimate.sigma) < tolerance
+    scale = estimate.sigma[:, :, None] * estimate.sigma[:, None, :]
+    assert np.max(np.abs(estimate.covariance - other.covariance) / scale) < tolerance
 
 
 @pytest.mark.parametrize(
@@ -234,8 +234,8 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
     # A wide prior and a wrong start, so that corrections are tenths of a radian and a missing Jacobian shows in the first digits.
     case = dataclasses.replace(CASES[name], duration=2.0, attitude_sigma=0.2, bias_sigma=0.02)
     record, initial = simulated(case, np.random.default_rng(11))
-    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
 # --------------------------------------------------------------------------------------------------------------------- consistency
@@ -327,8 +327,8 @@ def test_large_turns_are_split_into_sub_steps() -> None:
     )
     record, initial = simulated(case, np.random.default_rng(12))
     assert np.all(np.linalg.norm(record.increments, axis=1) > 1.5)
-    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-9)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, fixed_side_smoother(record, case.noise, initial), 1e-9)
 
 
 def test_a_start_half_way_round_is_survived() -> None:
@@ -369,11 +369,11 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
     P = np.diag([1e-4] * 3 + [1e-12] * 3)
     for bias in (0.5, 3.0):
         start = estimation.State(attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, bias]), covariance=P)
-        found = estimation.smooth(record, noise, start, full_covariance=True)
+        smoothed = estimation.smooth(record, noise, start, full_covariance=True)
         known = fixed_side_smoother(record, noise, start)
-        assert np.max(quaternion.angle_between(found.attitude, known.attitude)) < 1e-9
-        np.testing.assert_allclose(found.bias, known.bias, rtol=0, atol=1e-10)
-        np.testing.assert_allclose(found.variance, known.variance, rtol=1e-8)
+        assert np.max(quaternion.angle_between(smoothed.attitude, known.attitude)) < 1e-9
+        np.testing.assert_allclose(smoothed.bias, known.bias, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(smoothed.variance, known.variance, rtol=1e-8)
     with pytest.raises(InputError, match="many rotations in each gyro interval"):
         estimation.smooth(record, noise, dataclasses.replace(start, bias=np.array([0.0, 0.0, 1e4])))
 
@@ -534,7 +534,7 @@ def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_re
     noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
     both = estimation.smooth(record, noise, initial, full_covariance=True)
     finer = dataclasses.replace(
-        record, vectors=tuple(dataclasses.replace(one, sigma=1e-3 * one.sigma) for one in series)
+        record, vectors=tuple(dataclasses.replace(direction, sigma=1e-3 * direction.sigma) for direction in series)
     )
     with pytest.raises(InputError, match="times as precise as the state"):
         estimation.smooth(finer, noise, initial)
@@ -579,8 +579,8 @@ def test_any_number_of_segments(intervals: int) -> None:
     )
     record, initial = simulated(case, np.random.default_rng(intervals))
     record = records.cut(record, 0, intervals)
-    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
 @pytest.mark.parametrize("angle", [0.3, 0.4, 0.6])
@@ -592,11 +592,11 @@ def test_corrections_beyond_the_series(angle: float) -> None:
     initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], turn), attitude_sigma=0.3, bias_sigma=0.02
     )
-    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
     filtered = estimation.run(record, case.noise, initial)
-    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), one.attitude))
+    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), smoothed.attitude))
     assert (np.linalg.norm(moved, axis=1).max() > LARGEST_ANGLE) == (angle > 0.35)
-    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+    assert_same(smoothed, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
 def test_edges_are_found_exactly() -> None:
@@ -621,9 +621,9 @@ def test_edges_are_found_exactly() -> None:
         edges = np.cumsum(10.0 ** rng.uniform(-4.0, 0.0, 30))
         events = np.sort(np.exp(rng.uniform(*np.log(edges[[0, -1]]), 10)))
         at = np.sort(np.concatenate([edges, events]))
-        found = np.empty(len(edges), np.int64)
-        smoother_loop.locate_edges(edges, events, np.diff(at)[:, None], len(at) - 1, found)
-        np.testing.assert_array_equal(found, np.searchsorted(at, edges))
+        indices = np.empty(len(edges), np.int64)
+        smoother_loop.locate_edges(edges, events, np.diff(at)[:, None], len(at) - 1, indices)
+        np.testing.assert_array_equal(indices, np.searchsorted(at, edges))
 
 
 # ----------------------------------------------------------------------------------------------------------- sigmas of any magnitude
@@ -639,17 +639,17 @@ def linear_sigma(dt, measured, arw, rrw, attitude_sigma, bias_sigma, sigma):
         )
         P = mpmath.diag([mpmath.mpf(attitude_sigma) ** 2, mpmath.mpf(bias_sigma) ** 2])
         filtered = []
-        for k, seen in enumerate(measured):
+        for k, is_measured in enumerate(measured):
             P = F * P * F.T + Q if k else P
-            P = P - P[:, 0] * P[0, :] / (P[0, 0] + sigma**2) if seen else P
+            P = P - P[:, 0] * P[0, :] / (P[0, 0] + sigma**2) if is_measured else P
             filtered.append(P)
-        found = [P]
+        smoothed = [P]
         for before in reversed(filtered[:-1]):
             ahead = F * before * F.T + Q
             G = before * F.T * ahead**-1
             P = before + G * (P - ahead) * G.T
-            found.append(P)
-        return np.array([[float(mpmath.sqrt(P[i, i])) for i in range(2)] for P in reversed(found)])
+            smoothed.append(P)
+        return np.array([[float(mpmath.sqrt(P[i, i])) for i in range(2)] for P in reversed(smoothed)])
 
 
 def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
@@ -667,7 +667,7 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
         noise = ProcessNoise(angle_random_walk=arw, rate_random_walk=rrw)
         start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
         try:
-            found = estimation.smooth(record, noise, start)
+            smoothed = estimation.smooth(record, noise, start)
         except InputError as error:
             assert "no digits left" in str(error)  # noqa: PT017
             too_precise = max(attitude_sigma, bias_sigma * time[-1], arw, rrw) > 1e6 * sigma
@@ -675,8 +675,8 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
             refused += 1
             continue
         right = linear_sigma(dt, measured, arw, rrw, attitude_sigma, bias_sigma, sigma)
-        np.testing.assert_allclose(found.sigma, np.repeat(right, 3, axis=1), rtol=1e-3)
-        assert np.isfinite(found.attitude).all()
+        np.testing.assert_allclose(smoothed.sigma, np.repeat(right, 3, axis=1), rtol=1e-3)
+        assert np.isfinite(smoothed.attitude).all()
         far += right[:, 0].max() > 1e6 * right[:, 0].min()
     assert far > 10
     assert refused < 15
@@ -687,13 +687,13 @@ def test_an_attitude_known_far_better_than_the_noise_of_a_step_stays() -> None:
     turn = quaternion.exp([0.0, 0.0, 1e-3])
     time = np.array([0.0, 1.0])
     series = tuple(
-        dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.conjugate(turn), one.vector_b))
-        for one in (exact(str(k), "vector", time[1:], axis, 1e-6) for k, axis in enumerate(np.eye(3)))
+        dataclasses.replace(vector, vector_b=quaternion.rotate(quaternion.conjugate(turn), vector.vector_b))
+        for vector in (exact(str(k), "vector", time[1:], axis, 1e-6) for k, axis in enumerate(np.eye(3)))
     )
     record = ImuRecord(time=time, increments=np.zeros((1, 3)), vectors=series)
     start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1e-9, bias_sigma=1e-9)
-    found = estimation.smooth(record, ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0), start)
-    off = 2.0 * found.attitude[:, 3]
+    smoothed = estimation.smooth(record, ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0), start)
+    off = 2.0 * smoothed.attitude[:, 3]
     assert abs(off[0]) < 1e-14
     assert off[1] == pytest.approx(1e-3, rel=1e-5)
 

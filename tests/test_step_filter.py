@@ -86,8 +86,8 @@ def test_the_clock_of_given_stamps_is_theirs():
         f.predict([0.0, 0.0, 1e-3], time=t)
         other.predict([0.0, 0.0, 1e-3], t - (stamps[k - 1] if k else 1.7e9))
         assert f.time == t
-        for one in (f, other):
-            one.update(sample("direction", X, X, 0.1))
+        for step_filter in (f, other):
+            step_filter.update(sample("direction", X, X, 0.1))
     assert np.array_equal(f.P, other.P)
     assert other.time == pytest.approx(stamps[-1], abs=200 * np.spacing(1.7e9))
     f.predict([0.0, 0.0, 1e-3], time=stamps[-1])
@@ -98,12 +98,12 @@ def test_the_clock_of_given_stamps_is_theirs():
 
 
 def test_noise_is_given_by_axes_or_by_covariance():
-    found = []
+    covariances = []
     for noise in ({"sigma_axes": [[1e-2, 2e-2, 3e-2]]}, {"covariance": np.diag([1e-4, 4e-4, 9e-4])}):
         f = StepFilter(NOISE, begun(record_of(1.2), "plain"), (IRON,))
         assert f.update(replace(sample("direction", X, X, 0.0, "a"), **noise))
-        found.append(f.P)
-    np.testing.assert_allclose(*found, rtol=1e-14)
+        covariances.append(f.P)
+    np.testing.assert_allclose(*covariances, rtol=1e-14)
 
 
 @pytest.mark.parametrize("unit", [1.0, 2e-5])
@@ -114,13 +114,13 @@ def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
     assert f.update(sample("vector", value, reference, 0.01 * unit, "mag"))
     series = series_of("mag", "vector", [0.0], [value], reference, 0.01 * unit)
     record = resting(series)
-    found = estimation.run(record, NOISE, start(), full_covariance=True)
-    assert quaternion.angle_between(f.attitude, found.attitude[0]) < 1e-12
-    np.testing.assert_allclose(f.bias, found.bias[0], rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(f.P, found.covariance[0], rtol=1e-9, atol=1e-15)
+    estimate = estimation.run(record, NOISE, start(), full_covariance=True)
+    assert quaternion.angle_between(f.attitude, estimate.attitude[0]) < 1e-12
+    np.testing.assert_allclose(f.bias, estimate.bias[0], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(f.P, estimate.covariance[0], rtol=1e-9, atol=1e-15)
     assert np.linalg.norm(f.y) == pytest.approx(np.linalg.norm(value - reference), rel=1e-9)
     for nis in (f.nis, f.y @ np.linalg.solve(f.S, f.y)):
-        assert nis == pytest.approx(found.innovations["mag"].nis[0], rel=1e-9)
+        assert nis == pytest.approx(estimate.innovations["mag"].nis[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["", "Mag", "acc"])
@@ -152,8 +152,8 @@ def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, o
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
     time = 0.1 * np.arange(1.0, 9.0)
     vertical, lost = np.arange(8) % 2 == 0, np.arange(8) == 3
-    seen, up = np.where(vertical[:, None], UP, X), np.where(lost[:, None], np.nan, UP)
-    north, level = series_of("north", "heading", time, seen, X, 0.1), series_of("up", "direction", time, up, UP, 0.1)
+    heading, up = np.where(vertical[:, None], UP, X), np.where(lost[:, None], np.nan, UP)
+    north, level = series_of("north", "heading", time, heading, X, 0.1), series_of("up", "direction", time, up, UP, 0.1)
     edges = resting(north, level, time=np.linspace(0.0, 1.0, 11))
     rest = replace(edges, vectors=(north.taken(~vertical), level.taken(~lost)))
     both, without = (estimation.run(r, NOISE, start(), blocks, full_covariance=True, **options) for r in (edges, rest))

@@ -53,9 +53,9 @@ def tabular(text):
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), max_size=6))
 def test_csv_reads_back_to_the_bit(rows):
     keys = ("a", "b_deg", "c, d")
-    head, found = read_back(to_csv(keyed(keys, rows)))
+    head, read_rows = read_back(to_csv(keyed(keys, rows)))
     assert head == list(keys)
-    for row, given_row in zip(found, rows, strict=True):
+    for row, given_row in zip(read_rows, rows, strict=True):
         for text, value in zip(row, given_row, strict=True):
             if value is None or (isinstance(value, float) and math.isnan(value)):
                 assert text == ""
@@ -71,10 +71,10 @@ def test_csv_reads_back_to_the_bit(rows):
 def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
     keys = ("a", "b", "c")
     text = to_latex(keyed(keys, rows, "50 % of\nall"))
-    columns, head, found = tabular(text)
+    columns, head, body = tabular(text)
     assert (len(columns), head) == (3, list(keys))
-    assert len(found) == len(rows)
-    for k, row in enumerate(found):
+    assert len(body) == len(rows)
+    for k, row in enumerate(body):
         assert len(row) == 3, text
         for j, cell in enumerate(row):
             if not isinstance(rows[k][j], str):
@@ -86,11 +86,11 @@ def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
 def test_latex_rounds_and_aligns():
     rows = [("100 % of a_b", 1.23456e-8, "°/√h"), ("c", -62.391, "")]
     table = keyed(("name", "drift_deg_per_hour", "unit"), rows)
-    columns, head, found = tabular(to_latex(table))
+    columns, head, body = tabular(to_latex(table))
     assert columns == "lrl"
     assert head == ["name", r"drift, $^\circ$/h", "unit"]
-    assert found[0] == [r"100 \% of a\_b", r"$1.235 \times 10^{-8}$", r"$^\circ$/$\sqrt{\mathrm{h}}$"]
-    assert found[1][1] == "$-62.39$"
+    assert body[0] == [r"100 \% of a\_b", r"$1.235 \times 10^{-8}$", r"$^\circ$/$\sqrt{\mathrm{h}}$"]
+    assert body[1][1] == "$-62.39$"
 
 
 @pytest.fixture(scope="module")
@@ -141,32 +141,32 @@ WANTED = {
 def test_every_study_writes_its_tables(written, name):
     folder = written / "tables" / name
     assert {path.name for path in folder.iterdir()} == {
-        f"{one}.{end}" for one in WANTED[name] for end in ("csv", "tex")
+        f"{table}.{end}" for table in WANTED[name] for end in ("csv", "tex")
     }
-    for one in WANTED[name]:
-        head, rows = read_back((folder / f"{one}.csv").read_text(encoding="utf-8"))
+    for table in WANTED[name]:
+        head, rows = read_back((folder / f"{table}.csv").read_text(encoding="utf-8"))
         assert rows
-        columns, shown, found = tabular((folder / f"{one}.tex").read_text(encoding="utf-8"))
+        columns, shown, body = tabular((folder / f"{table}.tex").read_text(encoding="utf-8"))
         assert len(head) == len(columns) == len(shown)
-        assert [len(row) for row in found] == [len(columns)] * len(rows)
+        assert [len(row) for row in body] == [len(columns)] * len(rows)
 
 
 def test_coning_json_has_exactly_the_keys_of_issue_a_where_no_algorithm_is_ones_own(written):
     assert set(json.loads((written / "coning" / "coning.json").read_text())) == {"scenario", "integration", "filter"}
 
 
-def of(written, name, one):
-    head, rows = read_back((written / "tables" / name / f"{one}.csv").read_text(encoding="utf-8"))
+def of(written, name, table):
+    head, rows = read_back((written / "tables" / name / f"{table}.csv").read_text(encoding="utf-8"))
     return [dict(zip(head, row, strict=True)) for row in rows]
 
 
 def test_tables_hold_the_numbers_of_the_json(written):
     study = json.loads((written / "coning" / "coning.json").read_text())
-    for row, one in zip(of(written, "coning", "drift"), study["integration"], strict=True):
-        assert float(row["drift_deg_per_hour"]) == one["drift_deg_per_hour"]
-    for row, one in zip(of(written, "coning", "filters"), study["filter"], strict=True):
-        assert float(row["bias_mean_z_deg_per_hour"]) == one["bias_mean_deg_per_hour"][2]
-        assert row["consistent"] == str(one["consistent"])
+    for row, algorithm in zip(of(written, "coning", "drift"), study["integration"], strict=True):
+        assert float(row["drift_deg_per_hour"]) == algorithm["drift_deg_per_hour"]
+    for row, algorithm in zip(of(written, "coning", "filters"), study["filter"], strict=True):
+        assert float(row["bias_mean_z_deg_per_hour"]) == algorithm["bias_mean_deg_per_hour"][2]
+        assert row["consistent"] == str(algorithm["consistent"])
     last = json.loads((written / "mc.json").read_text())["last_epoch"]
     errors = of(written, "montecarlo", "errors")
     assert [row["state"] for row in errors] == [f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]
@@ -188,14 +188,14 @@ def test_tables_hold_the_numbers_of_the_json(written):
 
 
 def test_figures_are_written_in_the_format_asked_for(written):
-    found = {
+    signatures = {
         str(path.relative_to(written)): path.read_bytes()[:5]
         for path in written.rglob("*")
         if path.suffix in (".png", ".pdf", ".svg")
     }
     svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood", "filter-heldout"}
     pdf = {"covariance/budget", "estimate/estimate", "estimate/errors"}
-    assert found == {
+    assert signatures == {
         **dict.fromkeys((f"{x}.svg" for x in svg), b"<?xml"),
         **dict.fromkeys((f"{x}.pdf" for x in pdf), b"%PDF-"),
     }

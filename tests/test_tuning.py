@@ -31,12 +31,12 @@ SENSORS = ("sun.sigma", "up.sigma", "north.sigma", "tracker.sigma")
 ALL = ("gyro.arw", "gyro.rrw", *SENSORS, "initial.attitude", "initial.bias")
 
 
-def plain(record: ImuRecord, chosen: FilterSetup, attitude: np.ndarray, bias: np.ndarray) -> float:
+def plain(record: ImuRecord, filter_setup: FilterSetup, attitude: np.ndarray, bias: np.ndarray) -> float:
     """Minus the log likelihood, without its constant, by one ordinary run of the filter."""
-    estimate = setup.run(record, chosen, setup.initial_state(chosen, attitude, bias))
+    estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, attitude, bias))
     return sum(
-        float(0.5 * np.sum(np.log(one.variance) + one.innovation**2 / one.variance))
-        for one in estimate.innovations.values()
+        float(0.5 * np.sum(np.log(innovation.variance) + innovation.innovation**2 / innovation.variance))
+        for innovation in estimate.innovations.values()
     )
 
 
@@ -63,40 +63,43 @@ def test_a_common_scale_takes_a_start_whose_attitude_and_bias_are_correlated_as_
     initial = dataclasses.replace(initial, covariance=correlated)
     objective = tuning.likelihood([tuning.Case(record=record, initial=initial)], KINDS, (parameters.SCALE,))
     points = objective.start + np.array([[-1.0], [0.0], [0.7]])
-    for point, found in zip(points, objective.minus_log(points), strict=True):
+    for point, value in zip(points, objective.minus_log(points), strict=True):
         scaled = dataclasses.replace(initial, covariance=np.exp(2.0 * point) * correlated)
-        seen = setup.run(record, objective.setup(point), scaled).innovations.values()
-        expected = sum(0.5 * np.sum(np.log(one.variance) + one.innovation**2 / one.variance) for one in seen)
-        assert found == pytest.approx(expected, rel=1e-10)
+        by_sensor = setup.run(record, objective.setup(point), scaled).innovations.values()
+        expected = sum(
+            0.5 * np.sum(np.log(innovation.variance) + innovation.innovation**2 / innovation.variance)
+            for innovation in by_sensor
+        )
+        assert value == pytest.approx(expected, rel=1e-10)
 
 
 @pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
 def test_a_start_that_makes_the_bias_wild_is_cut_into_sub_steps_as_by_the_filter(bias_sigma):
     """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
     time = 0.3 * np.arange(21)
-    seen = np.concatenate([[0.1], time[2:]])
+    stamps = np.concatenate([[0.1], time[2:]])
     # The first attitude is nearly half a turn off: where little is known of the bias, the bias is blamed.
-    attitude = quaternion.exp(np.where(seen == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
+    attitude = quaternion.exp(np.where(stamps == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
     tracker = VectorMeasurements(
-        sensor="tracker", kind="attitude", time=seen, attitude=attitude, sigma_axes=np.full(3, 1e-2)
+        sensor="tracker", kind="attitude", time=stamps, attitude=attitude, sigma_axes=np.full(3, 1e-2)
     )
     record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(tracker,))
-    chosen = FilterSetup(
+    filter_setup = FilterSetup(
         process_noise=ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3),
         attitude_sigma=1e-2,
         bias_sigma=bias_sigma,
     )
-    initial = setup.initial_state(chosen, np.array([1.0, 0.0, 0.0, 0.0]))
-    wild = np.abs(setup.run(record, chosen, initial).bias).max()
+    initial = setup.initial_state(filter_setup, np.array([1.0, 0.0, 0.0, 0.0]))
+    wild = np.abs(setup.run(record, filter_setup, initial).bias).max()
     assert (wild * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
     objective = tuning.likelihood(
-        [tuning.Case(record=record, initial=initial)], chosen, ("gyro.arw", "tracker.sigma", "initial.bias")
+        [tuning.Case(record=record, initial=initial)], filter_setup, ("gyro.arw", "tracker.sigma", "initial.bias")
     )
     points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (8, 3))
     expected = [plain(record, objective.setup(point), initial.attitude, initial.bias) for point in points]
     np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-9)
     # Outliers no larger than the others are none.
-    mixed = tuning.contaminated_likelihood([tuning.Case(record=record, initial=initial)], chosen, objective.names)
+    mixed = tuning.contaminated_likelihood([tuning.Case(record=record, initial=initial)], filter_setup, objective.names)
     none = np.column_stack([points, np.full(8, np.log(0.05)), np.zeros(8)])
     np.testing.assert_allclose(mixed.minus_log(none), expected, rtol=1e-9)
 
@@ -128,15 +131,17 @@ def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
 
 def test_several_records_add_up_on_any_number_of_threads():
     cases = [case(seed) for seed in range(3)]
-    alone = [tuning.likelihood([one], BELIEVED, FREE) for one in cases]
+    alone = [tuning.likelihood([simulated_case], BELIEVED, FREE) for simulated_case in cases]
     together = tuning.likelihood(cases, BELIEVED, FREE, threads=2)
     point = together.start + 0.1
-    assert together.minus_log(point)[0] == pytest.approx(sum(one.minus_log(point)[0] for one in alone), rel=1e-13)
-    sums = [one.derivatives(point) for one in alone]
-    found = together.derivatives(point)
+    assert together.minus_log(point)[0] == pytest.approx(
+        sum(objective.minus_log(point)[0] for objective in alone), rel=1e-13
+    )
+    sums = [objective.derivatives(point) for objective in alone]
+    derivatives = together.derivatives(point)
     # The last bit of the point is another, and differences make much of it.
-    np.testing.assert_allclose(found.score.sum(axis=0), sum(one.score.sum(axis=0) for one in sums), rtol=1e-5)
-    np.testing.assert_allclose(found.information, sum(one.information for one in sums), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(derivatives.score.sum(axis=0), sum(part.score.sum(axis=0) for part in sums), rtol=1e-5)
+    np.testing.assert_allclose(derivatives.information, sum(part.information for part in sums), rtol=1e-5, atol=1e-5)
 
 
 def linear_likelihood(white, walk, sigma, first, drift, increments, angles, dt=0.5):
@@ -161,23 +166,23 @@ def linear_likelihood(white, walk, sigma, first, drift, increments, angles, dt=0
 
 
 def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many_digits():
-    one, increments, angles = angle_case(40)
+    linear_case, increments, angles = angle_case(40)
     names = ("gyro.arw", "gyro.rrw", "tracker.sigma", "initial.attitude", "initial.bias")
-    objective = tuning.likelihood([one], ANGLES, names)
-    found = objective.derivatives(objective.start)
+    objective = tuning.likelihood([linear_case], ANGLES, names)
+    derivatives = objective.derivatives(objective.start)
     with mpmath.workdps(40):
         values = [mpmath.mpf(float(x)) for x in objective.start]
 
         def exact(*logs):
             return linear_likelihood(*(mpmath.exp(x) for x in logs), increments, angles)
 
-        assert found.value.sum() == pytest.approx(float(exact(*values)), rel=1e-8)
+        assert derivatives.value.sum() == pytest.approx(float(exact(*values)), rel=1e-8)
         for j in range(len(names)):
             order = tuple(1 if k == j else 0 for k in range(len(names)))
             # The difference is wrong by half a step of the curvature, which is of the size of the information.
             expected = float(mpmath.diff(exact, tuple(values), order))
-            assert found.score.sum(axis=0)[j] == pytest.approx(
-                expected, abs=2.0 * innovations.STEP * max(found.information[j, j], abs(expected), 1.0)
+            assert derivatives.score.sum(axis=0)[j] == pytest.approx(
+                expected, abs=2.0 * innovations.STEP * max(derivatives.information[j, j], abs(expected), 1.0)
             )
 
 
@@ -186,14 +191,16 @@ def test_the_gradient_is_that_of_the_likelihood(free):
     start = tuning.record_case(every_kind(), KINDS, seed=3)
     objective = tuning.likelihood([start], KINDS, free, parts=5)
     point = objective.start + 0.2
-    found = objective.derivatives(point)
+    derivatives = objective.derivatives(point)
     expected = differences(lambda x: objective.minus_log(x)[0], point)
     np.testing.assert_allclose(
-        found.score.sum(axis=0), expected, atol=2.0 * innovations.STEP * np.abs(found.information).max() + 1e-6
+        derivatives.score.sum(axis=0),
+        expected,
+        atol=2.0 * innovations.STEP * np.abs(derivatives.information).max() + 1e-6,
     )
-    assert found.value.sum() == pytest.approx(objective.minus_log(point)[0], rel=1e-13)
-    assert np.linalg.eigvalsh(found.information).min() >= -1e-9
-    np.testing.assert_allclose(found.information, found.information.T)
+    assert derivatives.value.sum() == pytest.approx(objective.minus_log(point)[0], rel=1e-13)
+    assert np.linalg.eigvalsh(derivatives.information).min() >= -1e-9
+    np.testing.assert_allclose(derivatives.information, derivatives.information.T)
 
 
 def test_pairs_of_parameters_from_several_passes_are_those_of_one():
@@ -201,9 +208,9 @@ def test_pairs_of_parameters_from_several_passes_are_those_of_one():
     whole = tuning.likelihood([start], KINDS, ALL)
     few = tuning.likelihood([start], KINDS, ALL[2:6])
     many = whole.derivatives(whole.start)
-    one = few.derivatives(few.start)
-    np.testing.assert_allclose(many.information[2:6, 2:6], one.information, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(many.score[:, 2:6], one.score, atol=1e-6)
+    expected = few.derivatives(few.start)
+    np.testing.assert_allclose(many.information[2:6, 2:6], expected.information, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(many.score[:, 2:6], expected.score, atol=1e-6)
 
 
 def test_the_information_is_the_scatter_of_the_score():
@@ -211,10 +218,10 @@ def test_the_information_is_the_scatter_of_the_score():
     scores, information, outer = [], [], []
     for seed in range(120):
         objective = tuning.likelihood([case(seed, duration=100.0)], BELIEVED, FREE)
-        found = objective.derivatives(objective.start)
-        scores.append(found.score.sum(axis=0))
-        information.append(found.information)
-        outer.append(found.score.T @ found.score)
+        derivatives = objective.derivatives(objective.start)
+        scores.append(derivatives.score.sum(axis=0))
+        information.append(derivatives.information)
+        outer.append(derivatives.score.T @ derivatives.score)
     F, J = np.mean(information, axis=0), np.cov(np.array(scores).T)
     size = np.sqrt(np.outer(np.diag(F), np.diag(F)))
     np.testing.assert_allclose(J / size, F / size, atol=0.45)
@@ -226,13 +233,13 @@ def test_the_information_is_the_scatter_of_the_score():
 def test_a_common_scale_leaves_the_estimates_and_multiplies_the_variances():
     start = tuning.record_case(every_kind(), KINDS, seed=3)
     objective = tuning.likelihood([start], KINDS, ["filter.scale"])
-    chosen = objective.setup(np.log([2.0]))
-    one = setup.run(start.record, KINDS, start.initial)
-    two = setup.run(start.record, chosen, setup.initial_state(chosen, start.initial.attitude, start.initial.bias))
-    np.testing.assert_allclose(two.attitude, one.attitude, atol=1e-9)
-    np.testing.assert_allclose(two.variance, 4.0 * one.variance, rtol=1e-6)
-    squares = sum(float(innovation.nis.sum()) for innovation in one.innovations.values())
-    number = sum(innovation.innovation.size for innovation in one.innovations.values())
+    doubled = objective.setup(np.log([2.0]))
+    estimate = setup.run(start.record, KINDS, start.initial)
+    scaled = setup.run(start.record, doubled, setup.initial_state(doubled, start.initial.attitude, start.initial.bias))
+    np.testing.assert_allclose(scaled.attitude, estimate.attitude, atol=1e-9)
+    np.testing.assert_allclose(scaled.variance, 4.0 * estimate.variance, rtol=1e-6)
+    squares = sum(float(innovation.nis.sum()) for innovation in estimate.innovations.values())
+    number = sum(innovation.innovation.size for innovation in estimate.innovations.values())
     # Closed form of the best scale: the root of the mean of e²/s.
     best = tuning.fit(objective, starts=3)["filter.scale"]
     assert best.most_likely == pytest.approx(np.sqrt(squares / number), rel=1e-5)
@@ -253,8 +260,8 @@ def test_thinned_measurements_weigh_as_much_as_all():
     sparse = dataclasses.replace(record, vectors=(tuning.objective.thinned(star, 0.5),))
     assert len(sparse.vectors[0].time) == 20
     initial = setup.initial_state(BELIEVED, np.array([1.0, 0.0, 0.0, 0.0]))
-    of = lambda one, spacing: tuning.likelihood(  # noqa: E731
-        [tuning.Case(record=one, initial=initial)], BELIEVED, ("gyro.arw",), spacing=spacing
+    of = lambda record, spacing: tuning.likelihood(  # noqa: E731
+        [tuning.Case(record=record, initial=initial)], BELIEVED, ("gyro.arw",), spacing=spacing
     )
     at = of(record, 0.5).start
     assert of(record, 0.5).minus_log(at) == pytest.approx(of(sparse, 0.0).minus_log(at), rel=1e-12)
@@ -262,26 +269,31 @@ def test_thinned_measurements_weigh_as_much_as_all():
 
 def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
     """Each error lasts ten samples: independent once in ten, so the right σ of every sample is √10 times that of one."""
-    chosen = scenario(duration=600.0, rate=2.0)
-    record = scenarios.simulate(chosen, 5)
+    star_scenario = scenario(duration=600.0, rate=2.0)
+    record = scenarios.simulate(star_scenario, 5)
     random = np.random.default_rng(5)
     time = np.arange(1, 1200) * 0.5
-    body = chosen.motion.attitude(time)
+    body = star_scenario.motion.attitude(time)
     series = []
     for name, reference in (("star 1", [1.0, 0.0, 0.0]), ("star 2", [0.0, 1.0, 0.0])):
         error = np.repeat(1e-3 * random.standard_normal((120, 3)), 10, axis=0)[: len(time)]
-        seen = quaternion.rotate(quaternion.conjugate(body), np.array(reference)) + error
+        measured = quaternion.rotate(quaternion.conjugate(body), np.array(reference)) + error
         series.append(
             series_of(
-                name, "direction", time, seen / np.linalg.norm(seen, axis=1, keepdims=True), np.array(reference), 1e-3
+                name,
+                "direction",
+                time,
+                measured / np.linalg.norm(measured, axis=1, keepdims=True),
+                np.array(reference),
+                1e-3,
             )
         )
     record = dataclasses.replace(record, vectors=tuple(series))
     start = tuning.record_case(record, BELIEVED, seed=1)
     sparse = tuning.fit(tuning.likelihood([start], BELIEVED, ["star 1.sigma", "star 2.sigma"], spacing=5.0), starts=1)
-    for one in sparse.parameters:
-        assert one.value == pytest.approx(1e-3 * np.sqrt(10.0), rel=0.2)
-        assert one.lower < 1e-3 * np.sqrt(10.0) < one.upper
+    for parameter in sparse.parameters:
+        assert parameter.value == pytest.approx(1e-3 * np.sqrt(10.0), rel=0.2)
+        assert parameter.lower < 1e-3 * np.sqrt(10.0) < parameter.upper
     blind = tuning.fit(tuning.likelihood([start], BELIEVED, ["gyro.arw", "star 1.sigma", "star 2.sigma"]), starts=2)
     assert blind.misfit
     assert not sparse.misfit
@@ -292,24 +304,24 @@ def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
 
 @pytest.mark.parametrize("wrong", [30.0, 1.0 / 30.0])
 def test_from_thirty_times_wrong_twenty_starts_find_one_optimum(wrong):
-    one = case(duration=600.0)
-    values = tuning.values_of(BELIEVED, FREE, [one.record])
+    simulated_case = case(duration=600.0)
+    values = tuning.values_of(BELIEVED, FREE, [simulated_case.record])
     off = tuning.with_values(BELIEVED, {name: wrong * value for name, value in values.items()})
-    found = tuning.fit(tuning.likelihood([one], off, FREE), starts=20, intervals=False, threads=2)
-    assert found.agreeing == 20
-    assert np.ptp(found.optima, axis=0).max() < 1e-2
-    for parameter in found.parameters:
+    fit = tuning.fit(tuning.likelihood([simulated_case], off, FREE), starts=20, intervals=False, threads=2)
+    assert fit.agreeing == 20
+    assert np.ptp(fit.optima, axis=0).max() < 1e-2
+    for parameter in fit.parameters:
         assert abs(np.log(parameter.value / values[parameter.name])) < 4.0 * parameter.standard_error
         assert parameter.start == pytest.approx(wrong * values[parameter.name])
-    assert found.after < found.before
+    assert fit.after < fit.before
 
 
 def white_noise(n: int, seed: int = 3) -> tuple[tuning.Case, np.ndarray]:
     """A direction seen n times by a body whose attitude is as good as known: innovations are the noise itself, two a time."""
     random = np.random.default_rng(seed)
     noise = 1e-3 * random.standard_normal((n, 2))
-    seen = np.column_stack([noise, np.sqrt(1.0 - np.sum(noise**2, axis=1))])
-    series = series_of("star", "direction", np.arange(1.0, n + 1.0), seen, [0.0, 0.0, 1.0], 2e-3)
+    directions = np.column_stack([noise, np.sqrt(1.0 - np.sum(noise**2, axis=1))])
+    series = series_of("star", "direction", np.arange(1.0, n + 1.0), directions, [0.0, 0.0, 1.0], 2e-3)
     record = ImuRecord(time=np.arange(n + 1.0), increments=np.zeros((n, 3)), vectors=(series,))
     return tuning.Case(record=record, initial=setup.initial_state(SURE, np.array([1.0, 0.0, 0.0, 0.0]))), noise
 
@@ -322,11 +334,11 @@ SURE = FilterSetup(
 @pytest.mark.parametrize("n", [6, 4000])
 def test_white_noise_has_the_closed_form_answer(n):
     """σ̂² is the mean square; 2 Δℓ = m (r − 1 − ln r), r = σ̂²/σ², m squares; F of ln σ is 2 m."""
-    one, noise = white_noise(n)
-    found = tuning.fit(tuning.likelihood([one], SURE, ["star.sigma"]), starts=2)["star.sigma"]
+    noise_case, noise = white_noise(n)
+    parameter = tuning.fit(tuning.likelihood([noise_case], SURE, ["star.sigma"]), starts=2)["star.sigma"]
     m, best = noise.size, np.sqrt(np.mean(noise**2))
-    assert found.most_likely == pytest.approx(best, rel=1e-4)
-    assert found.standard_error == pytest.approx(1.0 / np.sqrt(2.0 * m), rel=1e-3)
+    assert parameter.most_likely == pytest.approx(best, rel=1e-4)
+    assert parameter.standard_error == pytest.approx(1.0 / np.sqrt(2.0 * m), rel=1e-3)
 
     def fallen(log_ratio):
         r = np.exp(-2.0 * log_ratio)
@@ -334,8 +346,8 @@ def test_white_noise_has_the_closed_form_answer(n):
 
     ends = [best * np.exp(brentq(fallen, *bracket)) for bracket in ((-3.0, 0.0), (0.0, 3.0))]
     # Well known, the parabola's ends stand for those of the profile.
-    np.testing.assert_allclose([found.lower, found.upper], ends, rtol=0.003 if n == 6 else 0.002)
-    assert found.identified
+    np.testing.assert_allclose([parameter.lower, parameter.upper], ends, rtol=0.003 if n == 6 else 0.002)
+    assert parameter.identified
 
 
 def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
@@ -343,32 +355,34 @@ def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
     bounds = []
     for seed in range(6):
         objective = tuning.likelihood([case(seed, walk=0.0, duration=300.0)], BELIEVED, FREE)
-        found = tuning.fit(objective, starts=2)
-        one = found["gyro.rrw"]
-        if not one.identified:
-            bounds.append(one.upper)
-            assert one.lower == 0.0
-            assert 0.2 * one.upper < one.value < one.upper
-            assert one.note == "not identified"
+        fit = tuning.fit(objective, starts=2)
+        parameter = fit["gyro.rrw"]
+        if not parameter.identified:
+            bounds.append(parameter.upper)
+            assert parameter.lower == 0.0
+            assert 0.2 * parameter.upper < parameter.value < parameter.upper
+            assert parameter.note == "not identified"
             # The others are the most likely ones beside the value that is used, not beside zero.
-            slope, size = objective.derivatives(found.point).score.sum(axis=0), 1.0 / np.sqrt(np.diag(found.covariance))
+            slope, size = objective.derivatives(fit.point).score.sum(axis=0), 1.0 / np.sqrt(np.diag(fit.covariance))
             assert np.all(np.abs(slope[[0, 2, 3]]) < 0.02 * size[[0, 2, 3]])
-            assert found.setup.process_noise.rate_random_walk == pytest.approx(one.value)
-        assert found["gyro.arw"].identified
+            assert fit.setup.process_noise.rate_random_walk == pytest.approx(parameter.value)
+        assert fit["gyro.arw"].identified
     assert len(bounds) >= 4
     assert max(bounds) < 20.0 * RRW
 
 
 def test_a_parameter_that_nothing_depends_on_is_reported_so():
     """A sensor at a single instant: its σ is not bounded by any amount of searching."""
-    one = case(duration=100.0)
-    star = one.record.vectors[0]
+    simulated_case = case(duration=100.0)
+    star = simulated_case.record.vectors[0]
     alone = dataclasses.replace(star, sensor="flash").taken(slice(50, 51))
-    record = dataclasses.replace(one.record, vectors=(*one.record.vectors, alone))
-    objective = tuning.likelihood([dataclasses.replace(one, record=record)], BELIEVED, ["gyro.arw", "flash.sigma"])
-    found = tuning.fit(objective, starts=1)["flash.sigma"]
-    assert not found.identified or found.upper / max(found.lower, 1e-9) > 4.0
-    assert np.isfinite(found.value)
+    record = dataclasses.replace(simulated_case.record, vectors=(*simulated_case.record.vectors, alone))
+    objective = tuning.likelihood(
+        [dataclasses.replace(simulated_case, record=record)], BELIEVED, ["gyro.arw", "flash.sigma"]
+    )
+    parameter = tuning.fit(objective, starts=1)["flash.sigma"]
+    assert not parameter.identified or parameter.upper / max(parameter.lower, 1e-9) > 4.0
+    assert np.isfinite(parameter.value)
 
 
 def test_no_information_is_no_certainty():
@@ -380,14 +394,14 @@ def test_no_information_is_no_certainty():
 
 
 def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():
-    one = case(3, walk=0.0, duration=300.0)
-    objective = tuning.likelihood([one], BELIEVED, FREE)
+    simulated_case = case(3, walk=0.0, duration=300.0)
+    objective = tuning.likelihood([simulated_case], BELIEVED, FREE)
     prior = {"gyro.rrw": tuning.Prior(value=1e-7, factor=3.0), "gyro.arw": tuning.Prior(value=2.0 * ARW, factor=3.0)}
-    found = tuning.fit(objective, priors=prior, starts=2)
-    assert found["gyro.rrw"].most_likely == pytest.approx(1e-7, rel=0.3)
-    assert found["gyro.rrw"].lower > 0.0
-    assert "prior" in found["gyro.rrw"].note
-    assert found["gyro.arw"].value == pytest.approx(tuning.fit(objective, starts=1)["gyro.arw"].value, rel=0.03)
+    fit = tuning.fit(objective, priors=prior, starts=2)
+    assert fit["gyro.rrw"].most_likely == pytest.approx(1e-7, rel=0.3)
+    assert fit["gyro.rrw"].lower > 0.0
+    assert "prior" in fit["gyro.rrw"].note
+    assert fit["gyro.arw"].value == pytest.approx(tuning.fit(objective, starts=1)["gyro.arw"].value, rel=0.03)
     # The closed form of two parabolas: a very narrow prior is the answer.
     narrow = {"gyro.arw": tuning.Prior(value=2.0 * ARW, factor=1.0001)}
     assert tuning.fit(objective, priors=narrow, starts=1)["gyro.arw"].value == pytest.approx(2.0 * ARW, rel=1e-3)
@@ -396,45 +410,51 @@ def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():
 def test_priors_from_a_specification_match_its_noise():
     spec = gyro.GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8)
     record = scenarios.simulate(scenario())
-    found = tuning.priors_from_gyro(spec, record, factor=2.0)
-    assert found == {"gyro.arw": tuning.Prior(value=2e-5, factor=2.0), "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0)}
+    priors = tuning.priors_from_gyro(spec, record, factor=2.0)
+    assert priors == {
+        "gyro.arw": tuning.Prior(value=2e-5, factor=2.0),
+        "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0),
+    }
     assert set(tuning.priors_from_gyro(gyro.GyroSpec(angle_random_walk=2e-5), record)) == {"gyro.arw"}
     flicker = dataclasses.replace(spec, bias_instability=2e-5)
     assert tuning.priors_from_gyro(flicker, record)["gyro.rrw"].value > 1e-8
 
 
 def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
-    one = case()
+    simulated_case = case()
     off = tuning.with_values(BELIEVED, {"gyro.arw": 3.0 * ARW})
-    found = tuning.fit(tuning.likelihood([one], off, ["gyro.arw", "star 2.sigma", "initial.bias"]), starts=1)
-    assert found.setup.process_noise.angle_random_walk == pytest.approx(found["gyro.arw"].value)
-    assert found.setup.process_noise.rate_random_walk == RRW
-    assert found.setup.sigma == {"star 2": pytest.approx(found["star 2.sigma"].value)}
-    assert found.setup.bias_sigma == pytest.approx(found["initial.bias"].value)
+    fit = tuning.fit(tuning.likelihood([simulated_case], off, ["gyro.arw", "star 2.sigma", "initial.bias"]), starts=1)
+    assert fit.setup.process_noise.angle_random_walk == pytest.approx(fit["gyro.arw"].value)
+    assert fit.setup.process_noise.rate_random_walk == RRW
+    assert fit.setup.sigma == {"star 2": pytest.approx(fit["star 2.sigma"].value)}
+    assert fit.setup.bias_sigma == pytest.approx(fit["initial.bias"].value)
     path = tmp_path / "filter.toml"
-    path.write_text(setup.to_toml(found.setup), encoding="utf-8")
-    assert setup.read_setup(path) == found.setup
+    path.write_text(setup.to_toml(fit.setup), encoding="utf-8")
+    assert setup.read_setup(path) == fit.setup
     # The filter of the file is the filter that was judged.
-    assert plain(one.record, found.setup, one.initial.attitude, one.initial.bias) == pytest.approx(
-        found.after, abs=0.02
-    )
+    assert plain(
+        simulated_case.record, fit.setup, simulated_case.initial.attitude, simulated_case.initial.bias
+    ) == pytest.approx(fit.after, abs=0.02)
 
 
 def test_the_scale_of_a_filter_multiplies_each_of_its_sigmas():
-    chosen = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
-    twice = parameters.with_values(chosen, {parameters.SCALE: 2.0})
+    filter_setup = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
+    twice = parameters.with_values(filter_setup, {parameters.SCALE: 2.0})
     assert twice.measurement_sigma_factor == 6.0
-    assert twice.process_noise.angle_random_walk == 2.0 * chosen.process_noise.angle_random_walk
-    assert twice.process_noise.rate_random_walk == 2.0 * chosen.process_noise.rate_random_walk
-    assert (twice.attitude_sigma, twice.bias_sigma) == (2.0 * chosen.attitude_sigma, 2.0 * chosen.bias_sigma)
+    assert twice.process_noise.angle_random_walk == 2.0 * filter_setup.process_noise.angle_random_walk
+    assert twice.process_noise.rate_random_walk == 2.0 * filter_setup.process_noise.rate_random_walk
+    assert (twice.attitude_sigma, twice.bias_sigma) == (
+        2.0 * filter_setup.attitude_sigma,
+        2.0 * filter_setup.bias_sigma,
+    )
 
 
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
     factor = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
-    one = case()
-    assert tuning.values_of(factor, ["star 1.sigma"], [one.record])["star 1.sigma"] == pytest.approx(3e-4)
-    a = tuning.fit(tuning.likelihood([one], factor, FREE), starts=1, intervals=False)
-    b = tuning.fit(tuning.likelihood([one], BELIEVED, FREE), starts=1, intervals=False)
+    simulated_case = case()
+    assert tuning.values_of(factor, ["star 1.sigma"], [simulated_case.record])["star 1.sigma"] == pytest.approx(3e-4)
+    a = tuning.fit(tuning.likelihood([simulated_case], factor, FREE), starts=1, intervals=False)
+    b = tuning.fit(tuning.likelihood([simulated_case], BELIEVED, FREE), starts=1, intervals=False)
     assert a["star 1.sigma"].value == pytest.approx(b["star 1.sigma"].value, rel=1e-3)
     assert a.setup.sigma["star 1"] * 3.0 == pytest.approx(a["star 1.sigma"].value)
 
@@ -445,10 +465,12 @@ def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
 def test_the_gradient_against_a_truth_is_that_of_its_value():
     objective = tuning.error_objective([case(1), case(2)], BELIEVED, FREE)
     point = objective.start + np.array([0.3, 0.5, -0.2, 0.1])
-    found = objective.derivatives(point)
+    derivatives = objective.derivatives(point)
     expected = differences(lambda x: objective.minus_log(x)[0], point)
     np.testing.assert_allclose(
-        found.score.sum(axis=0), expected, atol=3.0 * innovations.STEP * np.abs(found.information).max() + 1e-5
+        derivatives.score.sum(axis=0),
+        expected,
+        atol=3.0 * innovations.STEP * np.abs(derivatives.information).max() + 1e-5,
     )
 
 
@@ -460,16 +482,16 @@ AS_IT_RUNS = {
 }
 
 
-@pytest.mark.parametrize("chosen", AS_IT_RUNS.values(), ids=AS_IT_RUNS)
-def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector(chosen):
+@pytest.mark.parametrize("filter_setup", AS_IT_RUNS.values(), ids=AS_IT_RUNS)
+def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector(filter_setup):
     """Of the filter as it runs: with its gate, its weights and its error states."""
     from scipy.stats import multivariate_normal
 
-    one = case(1, outliers=0.05)
-    objective = tuning.error_objective([one], chosen, FREE)
+    simulated_case = case(1, outliers=0.05)
+    objective = tuning.error_objective([simulated_case], filter_setup, FREE)
     epochs = objective.references[0].epochs
-    estimate = setup.run(one.record, chosen, one.initial, full_covariance=True)
-    truth = one.record.truth
+    estimate = setup.run(simulated_case.record, filter_setup, simulated_case.initial, full_covariance=True)
+    truth = simulated_case.record.truth
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[epochs]
     expected = -sum(
         multivariate_normal(np.zeros(6), P, allow_singular=True).logpdf(e)
@@ -485,8 +507,10 @@ def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
     values = {}
     for name in ("plain", "gate"):
         objective = tuning.error_objective(cases, AS_IT_RUNS[name], ["star 1.sigma", "star 2.sigma"])
-        found = tuning.fit(objective, starts=1, intervals=False)
-        values[name] = [one.value / sigma for one, sigma in zip(found.parameters, two_stars.SIGMAS, strict=True)]
+        fit = tuning.fit(objective, starts=1, intervals=False)
+        values[name] = [
+            parameter.value / sigma for parameter, sigma in zip(fit.parameters, two_stars.SIGMAS, strict=True)
+        ]
     assert min(values["plain"]) > 1.4
     np.testing.assert_allclose(values["gate"], 1.0, rtol=0.35)
 
@@ -510,26 +534,26 @@ def test_progress_counts_what_has_ended_in_any_order():
 def test_against_a_truth_wrong_parameters_come_back():
     cases = [case(seed) for seed in range(4)]
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 1.sigma": 3e-5})
-    found = tuning.fit(
+    fit = tuning.fit(
         tuning.error_objective(cases, off, ["gyro.arw", "star 1.sigma"]), starts=2, factor=3.0, intervals=False
     )
     for name, true in (("gyro.arw", ARW), ("star 1.sigma", 1e-4)):
-        assert abs(np.log(found[name].value / true)) < max(4.0 * found[name].standard_error, 0.2)
-        assert found[name].standard_error < 0.4
+        assert abs(np.log(fit[name].value / true)) < max(4.0 * fit[name].standard_error, 0.2)
+        assert fit[name].standard_error < 0.4
     held = [case(seed) for seed in range(10, 14)]
-    compared = tuning.compare(held, off, found.setup)
+    compared = tuning.compare(held, off, fit.setup)
     assert abs(compared.after.anees - 1.0) < 0.35
     assert compared.after.attitude_rms < compared.before.attitude_rms
 
 
 def test_a_reference_attitude_beside_the_record_serves_as_truth():
-    one = case(1)
-    truth = one.record.truth
+    simulated_case = case(1)
+    truth = simulated_case.record.truth
     reference = truth.attitude.copy()
     reference[:50] = np.nan
     bare = dataclasses.replace(
-        one,
-        record=dataclasses.replace(one.record, truth=None),
+        simulated_case,
+        record=dataclasses.replace(simulated_case.record, truth=None),
         true_attitude=reference,
         judged=truth.attitude[:, 0] < 2.0,
     )
@@ -538,7 +562,11 @@ def test_a_reference_attitude_beside_the_record_serves_as_truth():
     assert np.isfinite(objective.derivatives(objective.start).value).all()
     judged = np.arange(len(reference)) >= 600
     held = tuning.compare([dataclasses.replace(bare, judged=judged)], BELIEVED, BELIEVED).after
-    estimate = setup.run(one.record, BELIEVED, setup.initial_state(BELIEVED, one.initial.attitude, one.initial.bias))
+    estimate = setup.run(
+        simulated_case.record,
+        BELIEVED,
+        setup.initial_state(BELIEVED, simulated_case.initial.attitude, simulated_case.initial.bias),
+    )
     expected = quaternion.angle_between(estimate.attitude, truth.attitude)[judged]
     assert held.attitude_rms == pytest.approx(np.sqrt(np.mean(expected**2)), rel=1e-6)
     assert np.isnan(held.anees)
@@ -548,25 +576,23 @@ def test_a_reference_attitude_beside_the_record_serves_as_truth():
 
 
 def test_a_split_by_time_tunes_on_the_beginning_and_judges_the_end():
-    one = case(1, duration=300.0)
-    (train,), (test,) = tuning.split([one], 0.25)
+    simulated_case = case(1, duration=300.0)
+    (train,), (test,) = tuning.split([simulated_case], 0.25)
     assert train.last == pytest.approx(225.0)
     assert test.first > train.last
-    whole, early, late = (tuning.likelihood([part], BELIEVED, FREE) for part in (one, train, test))
+    whole, early, late = (tuning.likelihood([part], BELIEVED, FREE) for part in (simulated_case, train, test))
     point = whole.start + 0.3
     assert early.minus_log(point)[0] + late.minus_log(point)[0] == pytest.approx(whole.minus_log(point)[0], rel=1e-12)
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
-    found = tuning.fit(tuning.likelihood([train], off, FREE), starts=1)
-    compared = tuning.compare([test], off, found.setup)
+    fit = tuning.fit(tuning.likelihood([train], off, FREE), starts=1)
+    compared = tuning.compare([test], off, fit.setup)
     assert compared.better
     low, high = compared.after.nis_bounds
     assert low < compared.after.nis < high
     assert not low < compared.before.nis < high
     # The mean log likelihood is that of the very innovations held out.
-    number = sum(2 * int(np.sum(series.time > train.last)) for series in one.record.vectors)
-    expected = -tuning.likelihood([test], found.setup, FREE).minus_log(found.point)[0] / number - 0.5 * np.log(
-        2 * np.pi
-    )
+    number = sum(2 * int(np.sum(series.time > train.last)) for series in simulated_case.record.vectors)
+    expected = -tuning.likelihood([test], fit.setup, FREE).minus_log(fit.point)[0] / number - 0.5 * np.log(2 * np.pi)
     assert compared.after.log_likelihood == pytest.approx(expected, rel=1e-9)
     verdict = compared.after.judgements[0].verdict
     assert verdict in ("consistent", "cannot tell")
@@ -579,9 +605,9 @@ def test_a_split_by_time_tunes_on_the_beginning_and_judges_the_end():
 # ------------------------------------------------------------------------------------------------------ where it starts
 
 
-def off_truth(record: ImuRecord, chosen: FilterSetup) -> float:
-    found = tuning.record_case(dataclasses.replace(record, truth=None), chosen).initial.attitude
-    return float(quaternion.angle_between(found, record.truth.attitude[0]))
+def off_truth(record: ImuRecord, filter_setup: FilterSetup) -> float:
+    attitude = tuning.record_case(dataclasses.replace(record, truth=None), filter_setup).initial.attitude
+    return float(quaternion.angle_between(attitude, record.truth.attitude[0]))
 
 
 def test_the_first_measurements_show_where_it_starts():
@@ -616,15 +642,17 @@ def test_the_first_measurements_show_where_it_starts():
 def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth():
     from strapdown.plots import tuning as drawing
 
-    one = case(1, duration=300.0)
+    simulated_case = case(1, duration=300.0)
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
-    compared = tuning.compare([one], off, BELIEVED)
+    compared = tuning.compare([simulated_case], off, BELIEVED)
     nees = {course.of: course for course in compared.after.nees}
     assert set(nees) == {"attitude", "bias"}
     # Spans of even length: their mean, weighted alike, is that of all epochs.
     mean = (np.nanmean(nees["attitude"].mean) + np.nanmean(nees["bias"].mean)) / 2.0
-    estimate = setup.run(one.record, BELIEVED, one.initial, full_covariance=True)
-    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
+    estimate = setup.run(simulated_case.record, BELIEVED, simulated_case.initial, full_covariance=True)
+    error = consistency.errors(
+        estimate.attitude, estimate.bias, simulated_case.record.truth.attitude, simulated_case.record.truth.bias
+    )
     expected = [
         np.mean(consistency.nees(error, estimate.covariance, consistency.SUBSETS[of])) / 3.0
         for of in ("attitude", "bias")
@@ -632,10 +660,10 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert mean == pytest.approx(np.mean(expected), rel=0.02)
     low, high = nees["attitude"].bounds
     assert low < 1.0 < high
-    seen = [(s.time, s.nis, np.full(len(s.time), s.innovation.shape[1])) for s in estimate.innovations.values()]
-    time, nis, degrees = (np.concatenate(part) for part in zip(*seen, strict=True))
+    by_sensor = [(s.time, s.nis, np.full(len(s.time), s.innovation.shape[1])) for s in estimate.innovations.values()]
+    time, nis, degrees = (np.concatenate(part) for part in zip(*by_sensor, strict=True))
     edges = np.linspace(time.min(), time.max() + 1e-9, len(compared.after.nis_course) + 1)
-    sums, numbers = (np.histogram(time, edges, weights=one)[0] for one in (nis, degrees))
+    sums, numbers = (np.histogram(time, edges, weights=weights)[0] for weights in (nis, degrees))
     np.testing.assert_allclose(compared.after.nis_course, sums / numbers, rtol=1e-9)
     np.testing.assert_array_equal(compared.after.nis_degrees, numbers)
     assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
@@ -647,9 +675,9 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     ]
     for line, filter_ in zip(figure.axes[0].lines, (compared.before, compared.after), strict=False):
         np.testing.assert_array_equal(line.get_ydata(), filter_.nis_course[filter_.nis_degrees > 0])
-    bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
+    bare = dataclasses.replace(simulated_case, record=dataclasses.replace(simulated_case.record, truth=None))
     assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
-    beside = dataclasses.replace(bare, true_attitude=one.record.truth.attitude)
+    beside = dataclasses.replace(bare, true_attitude=simulated_case.record.truth.attitude)
     assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.nees] == ["attitude"]
 
 
@@ -676,13 +704,13 @@ def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_like
     monkeypatch.setattr(fitting, "search", at)
     objective = types.SimpleNamespace(names=("star.sigma",), start=np.array([0.0]))
     best = types.SimpleNamespace(point=np.array([np.log(mode)]), local=types.SimpleNamespace(value=0.0))
-    found = fitting._profiled(objective, best, 0, {}, 1.0, 1.0)
-    assert not found.identified
-    assert found.lower == 0.0
-    assert found.upper == pytest.approx(mode + 1.6448536269514722, rel=0.006)
+    interval = fitting._profiled(objective, best, 0, {}, 1.0, 1.0)
+    assert not interval.identified
+    assert interval.lower == 0.0
+    assert interval.upper == pytest.approx(mode + 1.6448536269514722, rel=0.006)
     ratio = np.exp(-0.5 * mode**2) / math.sqrt(2.0 * np.pi) / (0.5 * math.erfc(-mode / math.sqrt(2.0)))
     # Over a range that ends at the bound it is low by 12 to 20 %.
-    assert found.mean == pytest.approx(mode + ratio, rel=0.006)
+    assert interval.mean == pytest.approx(mode + ratio, rel=0.006)
 
 
 @pytest.mark.parametrize(

@@ -49,12 +49,13 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
     said = succeeds("tune", record, "--filter", wrong, "--holdout", 0.3, "--starts", 3, "-o", out)
     assert "3 of 3 searches" in said
     assert "On the data held out" in said
-    found = setup.read_setup(out)
-    assert isinstance(found, FilterSetup)
-    assert found.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.3)
-    assert found.sigma["star 2"] == pytest.approx(2e-4, rel=0.2)
+    filter_setup = setup.read_setup(out)
+    assert isinstance(filter_setup, FilterSetup)
+    assert filter_setup.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.3)
+    assert filter_setup.sigma["star 2"] == pytest.approx(2e-4, rel=0.2)
     content = json.loads(out.with_suffix(".json").read_text())
-    assert [one["name"] for one in content["parameters"]] == ["gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma"]
+    names = [parameter["name"] for parameter in content["parameters"]]
+    assert names == ["gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma"]
     assert content["innovations_fit"]
     held = content["held_out"]
     assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
@@ -70,14 +71,14 @@ def test_the_command_and_python_give_the_same(succeeds, tmp_path, record, wrong,
     succeeds("tune", record, *shared, *flags, "-o", tmp_path / "tuned.toml")
     content = json.loads((tmp_path / "tuned.json").read_text())
     start = setup.read_setup(wrong)
-    found = sd.tune(sd.read(record), setup=start, free=["star 1.sigma"], starts=1, threads=1, **options)
-    assert found.setup == setup.read_setup(tmp_path / "tuned.toml")
-    for one in (content, summary := found.summary()):
-        for tested in one["unmodelled"]:
+    tuned = sd.tune(sd.read(record), setup=start, free=["star 1.sigma"], starts=1, threads=1, **options)
+    assert tuned.setup == setup.read_setup(tmp_path / "tuned.toml")
+    for document in (content, summary := tuned.summary()):
+        for tested in document["unmodelled"]:
             tested.pop("record")  # the command names the file
             tested.pop("words")
         for name in ("details", "words"):
-            one["report"].pop(name)
+            document["report"].pop(name)
     likelihood = content.pop("slices")[0]
     assert likelihood["name"] == content["parameters"][0]["name"]
     np.testing.assert_allclose(likelihood["values"][12], content["parameters"][0]["value"])
@@ -153,10 +154,10 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
     )
     assert status == 0, complaint
     assert "Optional states: gyro.scale" in said
-    found = setup.read_setup(out)
-    assert found.states is not None
-    assert found.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.5)
-    names = [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]]
+    filter_setup = setup.read_setup(out)
+    assert filter_setup.states is not None
+    assert filter_setup.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.5)
+    names = [parameter["name"] for parameter in json.loads(out.with_suffix(".json").read_text())["parameters"]]
     assert names == ["gyro.arw", "gyro.scale_sigma"]
 
 
@@ -166,13 +167,13 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, succeed
     record = recordfiles.read_record(scaled)
     gated = dataclasses.replace(setup.FilterSetup.for_record(record, states=True), gate=Gate())
     first.write_text(setup.to_toml(gated), encoding="utf-8")
-    given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
-    said = succeeds(*given, "--truth")
-    found = setup.read_setup(out)
-    assert found.states == gated.states
-    assert found.gate == gated.gate
+    command = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
+    said = succeeds(*command, "--truth")
+    filter_setup = setup.read_setup(out)
+    assert filter_setup.states == gated.states
+    assert filter_setup.gate == gated.gate
     assert "with its gate and weights" not in said
-    assert run(*given)[1].count("--truth tunes the filter with its gate and weights") == 1
+    assert run(*command)[1].count("--truth tunes the filter with its gate and weights") == 1
 
 
 @pytest.mark.slow
@@ -180,16 +181,16 @@ def test_outliers_beside_optional_states(succeeds, tmp_path):
     out = tmp_path / "states.toml"
     faults = vectors.Faults(outlier_probability=0.1, outlier_scale=10.0)
     spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.full(3, 2e-3))
-    sensors = tuple(dataclasses.replace(one, faults=faults) for one in SCENARIO.sensors)
+    sensors = tuple(dataclasses.replace(sensor, faults=faults) for sensor in SCENARIO.sensors)
     struck = scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec, sensors=sensors), 2)
     recordfiles.write_record(tmp_path / "struck.h5", struck)
     options = ("--states", "--gate", "--free", "star 1.sigma,star 2.sigma", "--starts", 1, "--holdout", 0.3)
     said = succeeds("tune", tmp_path / "struck.h5", *options, "-o", out)
     assert "is more likely an outlier than noise" in said
-    found, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())
-    assert found.states is not None
-    assert found.gate is not None
-    assert found.gate.probability == pytest.approx(content["gate"]["probability"])
+    filter_setup, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())
+    assert filter_setup.states is not None
+    assert filter_setup.gate is not None
+    assert filter_setup.gate.probability == pytest.approx(content["gate"]["probability"])
     held = content["held_out"]
     assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
 
@@ -211,14 +212,14 @@ def test_columns_and_topic_are_read_as_estimate_reads_them(run, refusal, tmp_pat
 def test_of_a_recording_without_its_errors_only_the_scale_is_tuned(refusal, tmp_path, options):
     """Its disturbances last: the likelier filter is as a rule worse."""
     path = tmp_path / "walk.csv"
-    one = hand_held.simulated(3, 0, 8.0)
-    columns = np.column_stack([one.time, one.rate, one.specific_force, one.magnetic_field])
+    recording = hand_held.simulated(3, 0, 8.0)
+    columns = np.column_stack([recording.time, recording.rate, recording.specific_force, recording.magnetic_field])
     header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
     np.savetxt(path, columns, delimiter=",", header=header, comments="")
     complaint = refusal("tune", path, "--out", tmp_path / "filter.toml", *options)
     assert "cannot be tuned by the innovations of a recording" in complaint
     assert not (tmp_path / "filter.toml").exists()
     with pytest.raises(InputError, match="cannot be tuned by the innovations"):
-        sd.tune(one, free=["gyro.arw"], threads=1)
-    found = sd.tune(one, starts=1, threads=1)
-    assert [parameter.name for parameter in found.parameters] == ["filter.scale"]
+        sd.tune(recording, free=["gyro.arw"], threads=1)
+    tuned = sd.tune(recording, starts=1, threads=1)
+    assert [parameter.name for parameter in tuned.parameters] == ["filter.scale"]

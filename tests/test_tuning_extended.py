@@ -44,15 +44,15 @@ def swaying(duration=60.0, **changes) -> Scenario:
 
 def filter_setup(scenario) -> setup.FilterSetup:
     """Return the filter that matches, without a better integration, as the motion is slow; with a lever arm, as some test needs one."""
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    arm = dataclasses.replace(chosen.states.sensors["acc"], lever_arm_sigma=(0.0, 0.1, 0.3))
-    states = dataclasses.replace(chosen.states, sensors={**chosen.states.sensors, "acc": arm})
-    return dataclasses.replace(chosen, states=states, integration=coning.ALGORITHMS["one-sample"])
+    matched = setup.FilterSetup.for_scenario(scenario, states=True)
+    arm = dataclasses.replace(matched.states.sensors["acc"], lever_arm_sigma=(0.0, 0.1, 0.3))
+    states = dataclasses.replace(matched.states, sensors={**matched.states.sensors, "acc": arm})
+    return dataclasses.replace(matched, states=states, integration=coning.ALGORITHMS["one-sample"])
 
 
-def wrong(chosen, factors) -> setup.FilterSetup:
-    values = tuning.values_of(chosen, list(factors), [])
-    return tuning.with_values(chosen, {name: factor * values[name] for name, factor in factors.items()})
+def wrong(right, factors) -> setup.FilterSetup:
+    values = tuning.values_of(right, list(factors), [])
+    return tuning.with_values(right, {name: factor * values[name] for name, factor in factors.items()})
 
 
 # ------------------------------------------------------------------------------------------------------------------- the likelihood
@@ -93,25 +93,29 @@ EVERY_STATE = {
 @pytest.mark.parametrize(("states", "sigma", "others"), EVERY_STATE.values(), ids=EVERY_STATE)
 def test_every_lane_is_the_filter_itself_with_every_state_and_kind_of_sensor(states, sigma, others):
     record = two_stars.every_kind(gaps=False)
-    chosen = dataclasses.replace(two_stars.KINDS, states=states, sigma=sigma)
-    one = tuning.record_case(record, chosen, seed=3)
+    filter_setup = dataclasses.replace(two_stars.KINDS, states=states, sigma=sigma)
+    case = tuning.record_case(record, filter_setup, seed=3)
     names = (*others, *parameters.state_names(states))
-    objective = tuning.likelihood([one], chosen, names, parts=7)
+    objective = tuning.likelihood([case], filter_setup, names, parts=7)
     points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (9, len(names)))
     points[8] = objective.start
     if "gyro.scale_sigma" in names:
         points[3, names.index("gyro.scale_sigma")] = -np.inf  # a state that is zero
     expected = []
     for point in points:
-        found = setup.run(record, objective.setup(point), objective.initial(one, objective.setup(point))).innovations
-        expected.append(0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in found.values()))
+        innovations = setup.run(
+            record, objective.setup(point), objective.initial(case, objective.setup(point))
+        ).innovations
+        expected.append(
+            0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in innovations.values())
+        )
     # A step is cut where the bias of any lane needs it, which matters to scale factors and forces.
     np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-6 if states is OF_THE_GYRO else 1e-9)
     step = 1e-4 * np.eye(len(names))
     slopes = objective.minus_log(points[8] + step) - objective.minus_log(points[8] - step)
-    found = objective.derivatives(points[8])
-    np.testing.assert_allclose(found.score.sum(axis=0), slopes / 2e-4, rtol=1e-3, atol=1e-2)
-    assert np.linalg.eigvalsh(found.information).min() > -1e-9 * found.information.max()
+    derivatives = objective.derivatives(points[8])
+    np.testing.assert_allclose(derivatives.score.sum(axis=0), slopes / 2e-4, rtol=1e-3, atol=1e-2)
+    assert np.linalg.eigvalsh(derivatives.information).min() > -1e-9 * derivatives.information.max()
 
 
 def test_of_a_bias_over_temperature_it_is_that_of_a_linear_filter():
@@ -130,15 +134,15 @@ def test_of_a_bias_over_temperature_it_is_that_of_a_linear_filter():
         sigma_axes=np.full(3, sensor),
     )
     record = records.ImuRecord(time=time, increments=turns, vectors=(tracker,), temperature=T)
-    chosen = dataclasses.replace(two_stars.ANGLES, bias_sigma=1e-5, states=States(gyro_temperature_sigma=2e-5))
-    one = tuning.Case(record=record, initial=setup.initial_state(chosen, quaternion.IDENTITY))
-    objective = tuning.likelihood([one], chosen, ["gyro.temperature_sigma", "gyro.rrw", "tracker.sigma"])
+    filter_setup = dataclasses.replace(two_stars.ANGLES, bias_sigma=1e-5, states=States(gyro_temperature_sigma=2e-5))
+    case = tuning.Case(record=record, initial=setup.initial_state(filter_setup, quaternion.IDENTITY))
+    objective = tuning.likelihood([case], filter_setup, ["gyro.temperature_sigma", "gyro.rrw", "tracker.sigma"])
     points = objective.start + np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 0.2]])
     for point, value in zip(points, objective.minus_log(points), strict=True):
         slope, walk, noise = np.exp(point)
-        white, expected, H = chosen.process_noise.angle_random_walk, 0.0, np.array([1.0, 0.0, 0.0])
+        white, expected, H = filter_setup.process_noise.angle_random_walk, 0.0, np.array([1.0, 0.0, 0.0])
         for axis in range(3):
-            x, P = np.zeros(3), np.diag([chosen.attitude_sigma, 1e-5, slope]) ** 2.0
+            x, P = np.zeros(3), np.diag([filter_setup.attitude_sigma, 1e-5, slope]) ** 2.0
             for k in range(1200):
                 F = np.eye(3)
                 F[0, 1:] = -dt, -dt * warm[k]
@@ -156,21 +160,21 @@ def test_of_a_bias_over_temperature_it_is_that_of_a_linear_filter():
 
 def test_it_is_that_of_ordinary_runs_and_score_and_curvature_are_its_derivatives():
     scenario = swaying(20.0)
-    chosen = filter_setup(scenario)
-    one = case_of(scenario, chosen, 5)
-    objective = tuning.likelihood([one], chosen, [*COLOURED, "gyro.arw"])
+    matched = filter_setup(scenario)
+    case = case_of(scenario, matched, 5)
+    objective = tuning.likelihood([case], matched, [*COLOURED, "gyro.arw"])
     point = objective.start + 0.2
     points = np.stack([objective.start, point, objective.start + np.array([0.5, -0.4, 0.3, -0.2])])
-    runs = [setup.run(one.record, objective.setup(x), objective.initial(one, objective.setup(x))) for x in points]
+    runs = [setup.run(case.record, objective.setup(x), objective.initial(case, objective.setup(x))) for x in points]
     series = [run.innovations.values() for run in runs]
     expected = [0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in s) for s in series]
     np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-9)
-    found = objective.derivatives(point)
+    derivatives = objective.derivatives(point)
     h = 1e-3
     for j in range(len(point)):
         ends = objective.minus_log(np.stack([point + h * np.eye(4)[j], point - h * np.eye(4)[j]]))
         slope = (ends[0] - ends[1]) / (2.0 * h)
-        assert found.score[:, j].sum() == pytest.approx(slope, rel=1e-3, abs=1e-2)
+        assert derivatives.score[:, j].sum() == pytest.approx(slope, rel=1e-3, abs=1e-2)
     curvature = objective.curvature(point)
     step = 0.02
     for j in range(len(point)):
@@ -186,17 +190,17 @@ def test_it_is_that_of_ordinary_runs_and_score_and_curvature_are_its_derivatives
 def test_evaluations_are_ordinary_runs_but_prepare_the_gyro_only_once(spacing, monkeypatch):
     """Neither the integration of the gyro nor the angular acceleration at the measurements depends on what is tuned."""
     scenario = swaying(20.0)
-    chosen = dataclasses.replace(
+    matched = dataclasses.replace(
         filter_setup(scenario), integration=coning.ALGORITHMS["two-sample"], sigma={"mag": 6e-7}
     )
-    one = case_of(scenario, chosen, 5)
-    objective = tuning.likelihood([one], chosen, ["gyro.arw", "acc.sigma", "acc.lever_sigma"], spacing=spacing)
+    case = case_of(scenario, matched, 5)
+    objective = tuning.likelihood([case], matched, ["gyro.arw", "acc.sigma", "acc.lever_sigma"], spacing=spacing)
     point, epochs = objective.start + 0.1, np.arange(10, 200, 10)
     used = objective.setup(point)
-    record = setup.modelled_record(one.record, used)
+    record = setup.modelled_record(case.record, used)
     record = dataclasses.replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
     plain = dataclasses.replace(used, sigma={}, integration=coning.ALGORITHMS["one-sample"])
-    expected = setup.run(record, plain, one.initial, full_covariance=True)
+    expected = setup.run(record, plain, case.initial, full_covariance=True)
     innovations = expected.innovations.values()
     value = 0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in innovations)
     monkeypatch.setattr(forward, "turning", None)
@@ -223,18 +227,18 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
         "mag.bias_sigma",
         "a.b.lever_sigma",
     )
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0), states=False), states=states)
-    values = tuning.values_of(chosen, ["mag.bias_sigma", "gyro.scale_sigma"], [])
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0), states=False), states=states)
+    values = tuning.values_of(filter_setup, ["mag.bias_sigma", "gyro.scale_sigma"], [])
     assert list(values.values()) == pytest.approx([np.sqrt(3.0), 1e-3 * np.sqrt(2.5)])
     changed = tuning.with_values(
-        chosen, {"mag.bias_sigma": 2.0 * np.sqrt(3.0), "gyro.drift_sigma": 3e-6, "a.b.lever_sigma": 0.1}
+        filter_setup, {"mag.bias_sigma": 2.0 * np.sqrt(3.0), "gyro.drift_sigma": 3e-6, "a.b.lever_sigma": 0.1}
     ).states
     assert changed.sensors["mag"].bias_sigma == pytest.approx((2.0, 4.0, 4.0))
     assert changed.gyro_drift_sigma == pytest.approx((3e-6, 3e-6))
     assert changed.gyro_fast_bias_sigma == pytest.approx(12e-7)
     assert changed.sensors["a.b"].lever_arm_sigma == pytest.approx(0.1)
     assert changed.gyro_scale_sigma == states.gyro_scale_sigma
-    twice = tuning.with_values(chosen, {"filter.scale": 2.0}).states
+    twice = tuning.with_values(filter_setup, {"filter.scale": 2.0}).states
     assert twice.gyro_scale_sigma == pytest.approx((2e-3, 0.0, 4e-3))
     assert twice.gyro_drift_sigma == pytest.approx((2e-6, 2e-6))
     assert (twice.gyro_drift_time, twice.gyro_fast_bias_sigma) == (states.gyro_drift_time, 8e-7)
@@ -245,10 +249,10 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
 def test_a_search_stays_where_a_state_makes_sense():
     """Scale factors below a tenth, for the filter is linear in them; times from a part of the interval to many records."""
     scenario = swaying(20.0)
-    chosen = filter_setup(scenario)
-    chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_scale_sigma=1e-3))
+    matched = filter_setup(scenario)
+    matched = dataclasses.replace(matched, states=dataclasses.replace(matched.states, gyro_scale_sigma=1e-3))
     free = ["gyro.scale_sigma", "acc.correlation_time", "acc.correlated_sigma"]
-    objective = tuning.likelihood([case_of(scenario, chosen, 1)], chosen, free)
+    objective = tuning.likelihood([case_of(scenario, matched, 1)], matched, free)
     far, near = (objective.setup(objective.start + step).states for step in (12.0, -12.0))
     assert far.gyro_scale_sigma == pytest.approx(0.1)
     assert far.sensors["acc"].correlation_time == pytest.approx(100.0 * 20.0)
@@ -265,16 +269,14 @@ def test_a_search_stays_where_a_state_makes_sense():
 def recovered(seeds, duration) -> tuple[np.ndarray, np.ndarray]:
     """Return errors of the log parameters over their standard errors, and whether the 95 % interval holds the truth, by seed."""
     scenario = swaying(duration)
-    chosen = filter_setup(scenario)
-    off = wrong(chosen, {"acc.correlated_sigma": 3.0, "acc.correlation_time": 0.3})
+    matched = filter_setup(scenario)
+    off = wrong(matched, {"acc.correlated_sigma": 3.0, "acc.correlation_time": 0.3})
     off = dataclasses.replace(off, sigma={"acc": 0.12})
     ratios, inside = [], []
     for seed in seeds:
-        objective = tuning.likelihood([case_of(scenario, chosen, seed)], off, list(COLOURED))
-        found = tuning.fit(objective, starts=1, intervals=False)
-        ratios.append(
-            [np.log(found[name].value / value) / found[name].standard_error for name, value in COLOURED.items()]
-        )
+        objective = tuning.likelihood([case_of(scenario, matched, seed)], off, list(COLOURED))
+        fit = tuning.fit(objective, starts=1, intervals=False)
+        ratios.append([np.log(fit[name].value / value) / fit[name].standard_error for name, value in COLOURED.items()])
         half = 1.96
         inside.append(np.abs(ratios[-1]) < half)
     return np.array(ratios), np.array(inside)
@@ -298,14 +300,16 @@ def test_a_state_that_nothing_shows_is_not_identified():
     """At rest the scale of a quiet gyro is multiplied by nothing, and its σ makes no difference. (Of a noisy one the noise is.)"""
     quiet = gyro.GyroSpec(angle_random_walk=1e-6, rate_random_walk=1e-9, turn_on_bias_sigma=1e-6)
     scenario = dataclasses.replace(swaying(20.0), motion=motion.rest(), gyro=quiet)
-    chosen = filter_setup(scenario)
-    chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_scale_sigma=1e-3))
-    objective = tuning.likelihood([case_of(scenario, chosen, 2)], chosen, ["gyro.scale_sigma", "acc.correlated_sigma"])
-    found = tuning.fit(objective, starts=1)
-    assert not found.composite  # the curvature of innovations is their information
-    assert not found["gyro.scale_sigma"].identified
-    assert "not identified" in found["gyro.scale_sigma"].note
-    assert found["acc.correlated_sigma"].identified
+    matched = filter_setup(scenario)
+    matched = dataclasses.replace(matched, states=dataclasses.replace(matched.states, gyro_scale_sigma=1e-3))
+    objective = tuning.likelihood(
+        [case_of(scenario, matched, 2)], matched, ["gyro.scale_sigma", "acc.correlated_sigma"]
+    )
+    fit = tuning.fit(objective, starts=1)
+    assert not fit.composite  # the curvature of innovations is their information
+    assert not fit["gyro.scale_sigma"].identified
+    assert "not identified" in fit["gyro.scale_sigma"].note
+    assert fit["acc.correlated_sigma"].identified
 
 
 @pytest.mark.slow
@@ -316,18 +320,18 @@ def test_hard_iron_is_tuned_from_several_records():
     for k in range(8):
         iron = sigma * generator(9, k, "iron").standard_normal(3)
         records.append(swaying(15.0, hard_iron=iron))
-    chosen = filter_setup(records[0])
+    matched = filter_setup(records[0])
     off = dataclasses.replace(
-        chosen,
+        matched,
         states=dataclasses.replace(
-            chosen.states, sensors={**chosen.states.sensors, "mag": SensorStates(bias_sigma=sigma / 5.0)}
+            matched.states, sensors={**matched.states.sensors, "mag": SensorStates(bias_sigma=sigma / 5.0)}
         ),
     )
-    cases = [case_of(one, off, 9, k) for k, one in enumerate(records)]
-    found = tuning.fit(tuning.likelihood(cases, off, ["mag.bias_sigma"]), starts=1, intervals=False)
-    one = found["mag.bias_sigma"]
-    assert 0.1 < one.standard_error < 0.25
-    assert abs(np.log(one.value / sigma)) < 2.6 * one.standard_error
+    cases = [case_of(scenario, off, 9, k) for k, scenario in enumerate(records)]
+    fit = tuning.fit(tuning.likelihood(cases, off, ["mag.bias_sigma"]), starts=1, intervals=False)
+    parameter = fit["mag.bias_sigma"]
+    assert 0.1 < parameter.standard_error < 0.25
+    assert abs(np.log(parameter.value / sigma)) < 2.6 * parameter.standard_error
 
 
 # ------------------------------------------------------------------------------------------------------------------------- held out
@@ -348,28 +352,30 @@ FREE = {
 def tuned_and_held_out(name: str, train: int, test: int, seed: int, free=(), **changes) -> list[str]:
     """Return what is outside its bounds on records not used, after tuning from σ wrong by a factor of three either way."""
     scenario = dataclasses.replace(scenarios.load_scenario(name), **changes)
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     free = free or FREE[name]
-    plain = [part for part in free if part not in parameters.state_names(chosen.states)]
-    cases = [case_of(scenarios.drawn(scenario, seed, run), chosen, seed, run) for run in range(train)]
-    values = tuning.values_of(chosen, plain, [case.record for case in cases])
-    off = tuning.with_values(chosen, {part: value * 3.0 ** (-1) ** k for k, (part, value) in enumerate(values.items())})
+    plain = [part for part in free if part not in parameters.state_names(filter_setup.states)]
+    cases = [case_of(scenarios.drawn(scenario, seed, run), filter_setup, seed, run) for run in range(train)]
+    values = tuning.values_of(filter_setup, plain, [case.record for case in cases])
+    off = tuning.with_values(
+        filter_setup, {part: value * 3.0 ** (-1) ** k for k, (part, value) in enumerate(values.items())}
+    )
     off = wrong(off, {part: 1.0 / 3.0 for part in free if part not in plain}) if len(plain) < len(free) else off
-    found = tuning.fit(tuning.likelihood(cases, off, free), starts=1, intervals=False)
+    fit = tuning.fit(tuning.likelihood(cases, off, free), starts=1, intervals=False)
     nees: dict = {subset: [] for subset in consistency.SUBSETS}
     nis: dict = {}
     for run in range(train, train + test):
-        case = case_of(scenarios.drawn(scenario, seed, run), chosen, seed, run)
-        steps = len(setup.modelled_record(case.record, found.setup).increments)
-        estimate = setup.run(case.record, found.setup, case.initial, every=steps // 5, full_covariance=True)
-        truth = setup.modelled_record(case.record, found.setup).truth
+        case = case_of(scenarios.drawn(scenario, seed, run), filter_setup, seed, run)
+        steps = len(setup.modelled_record(case.record, fit.setup).increments)
+        estimate = setup.run(case.record, fit.setup, case.initial, every=steps // 5, full_covariance=True)
+        truth = setup.modelled_record(case.record, fit.setup).truth
         every = steps // 5
         error = errors_of(estimate, truth, every)[1:6]
         for subset, states in consistency.SUBSETS.items():
             nees[subset].append(consistency.nees(error, estimate.covariance[1:6], states))
-        for sensor, one in estimate.innovations.items():
+        for sensor, innovation in estimate.innovations.items():
             total = nis.setdefault(sensor, np.zeros(2))
-            total += (one.nis.sum(), one.innovation.size)
+            total += (innovation.nis.sum(), innovation.innovation.size)
     wrong_ones = []
     for subset, values_of_runs in nees.items():
         degrees = len(consistency.SUBSETS[subset])
@@ -403,12 +409,12 @@ def test_after_tuning_held_out_statistics_pass_in_every_built_in_scenario(name):
 
 def test_a_case_of_first_measurements_is_taken_too():
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=60.0)
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    case = tuning.record_case(scenarios.simulate(scenario, 1), chosen)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
+    case = tuning.record_case(scenarios.simulate(scenario, 1), filter_setup)
     assert isinstance(case.initial, estimation.State)
-    objective = tuning.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])
+    objective = tuning.likelihood([case], filter_setup, ["gyro.arw", "initial.bias", "star.sigma"])
     assert np.all(np.isfinite(objective.derivatives(objective.start).information))
-    assert objective.setup(objective.start + np.log(2.0)).bias_sigma == pytest.approx(2.0 * chosen.bias_sigma)
+    assert objective.setup(objective.start + np.log(2.0)).bias_sigma == pytest.approx(2.0 * filter_setup.bias_sigma)
 
 
 def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
@@ -417,5 +423,5 @@ def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
     size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
     size |= {"°/h/K": degree / 3600.0, "°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
     names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters._WHOLE)
-    for name in (*names, *(f"mag.{one}" for one in parameters.SENSOR_STATES)):
+    for name in (*names, *(f"mag.{state}" for state in parameters.SENSOR_STATES)):
         assert parameters.unit_of(name).factor == pytest.approx(size[parameters.unit_of(name).name], rel=1e-12), name

@@ -32,12 +32,13 @@ def case(seed: int = 0, duration: float = 200.0, share: float = 0.05) -> tuning.
 # --------------------------------------------------------------------------------------------------- the likelihood
 
 
-def plain_mixture(share, scale, chosen, increments, angles, dt=0.5, sigma=1e-6):
+def plain_mixture(share, scale, filter_setup, increments, angles, dt=0.5, sigma=1e-6):
     """Minus the log likelihood, and the probability of each outlier, by a Kalman filter of (angles, biases, drifts) in matrices.
 
     σ may differ by axis. Transition and noise of a step come from the exponential of the continuous model (Van Loan 1978).
     """
-    white, walk, states = chosen.process_noise.angle_random_walk, chosen.process_noise.rate_random_walk, chosen.states
+    process_noise, states = filter_setup.process_noise, filter_setup.states
+    white, walk = process_noise.angle_random_walk, process_noise.rate_random_walk
     eye, none = np.eye(3), np.zeros((3, 3))
     drift, time = (0.0, 1.0) if states is None else (states.gyro_drift_sigma[0], states.gyro_drift_time[0])
     A = np.block([[none, -eye, -eye], [none, none, none], [none, none, -eye / time]])
@@ -47,7 +48,7 @@ def plain_mixture(share, scale, chosen, increments, angles, dt=0.5, sigma=1e-6):
     Q = F @ both[:9, 9:]
     H = np.hstack([eye, none, none])
     parts = np.block([[eye, none, none], [none, eye, -eye], [none, none, eye]])  # the whole bias is that and the drift
-    start = np.diag(np.repeat([chosen.attitude_sigma**2, chosen.bias_sigma**2, drift**2], 3))
+    start = np.diag(np.repeat([filter_setup.attitude_sigma**2, filter_setup.bias_sigma**2, drift**2], 3))
     x, P, R = np.zeros(9), parts @ start @ parts.T, np.diag(np.broadcast_to(sigma, 3) ** 2.0)
     total, probabilities = 0.0, []
     for increment, angle in zip(increments, angles, strict=True):
@@ -77,9 +78,11 @@ def probabilities(objective: tuning.outliers.Likelihood, point: np.ndarray) -> n
 
 
 def test_in_the_linear_case_it_is_the_filter_of_two_normals():
-    (one, increments, angles), chosen = two_stars.angle_case(60, struck=0.2), ANGLES
-    objective = tuning.contaminated_likelihood([one], chosen, ["gyro.arw", "tracker.sigma"], share=0.1, scale=6.0)
-    expected, struck = plain_mixture(0.1, 6.0, chosen, increments, angles)
+    (case, increments, angles), filter_setup = two_stars.angle_case(60, struck=0.2), ANGLES
+    objective = tuning.contaminated_likelihood(
+        [case], filter_setup, ["gyro.arw", "tracker.sigma"], share=0.1, scale=6.0
+    )
+    expected, struck = plain_mixture(0.1, 6.0, filter_setup, increments, angles)
     assert objective.minus_log(objective.start)[0] == pytest.approx(expected, rel=1e-7)
     np.testing.assert_allclose(probabilities(objective, objective.start), struck, rtol=1e-4, atol=1e-7)
     # Eight points at once are one after the other.
@@ -88,15 +91,17 @@ def test_in_the_linear_case_it_is_the_filter_of_two_normals():
     np.testing.assert_allclose(objective.minus_log(points), alone, rtol=1e-12)
     for point, value in zip(points, alone, strict=True):
         arw, sigma, share, scale = np.exp(point)
-        other = dataclasses.replace(chosen, process_noise=ProcessNoise(angle_random_walk=arw, rate_random_walk=2e-7))
+        other = dataclasses.replace(
+            filter_setup, process_noise=ProcessNoise(angle_random_walk=arw, rate_random_walk=2e-7)
+        )
         assert value == pytest.approx(plain_mixture(share, scale, other, increments, angles, sigma=sigma)[0], rel=1e-7)
 
 
 def test_in_the_linear_case_with_a_drift_and_noise_by_axis_likewise():
-    (one, increments, angles), plain = two_stars.angle_case(60, struck=0.2), ANGLES
-    chosen = dataclasses.replace(plain, states=States(gyro_drift_sigma=(8e-7,), gyro_drift_time=(3.0,)))
+    (case, increments, angles), plain = two_stars.angle_case(60, struck=0.2), ANGLES
+    filter_setup = dataclasses.replace(plain, states=States(gyro_drift_sigma=(8e-7,), gyro_drift_time=(3.0,)))
     names = ("gyro.arw", "gyro.drift_sigma", "gyro.drift_time", "tracker.sigma.y")
-    objective = tuning.contaminated_likelihood([one], chosen, names, share=0.1, scale=6.0)
+    objective = tuning.contaminated_likelihood([case], filter_setup, names, share=0.1, scale=6.0)
     points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (5, 6))
     for point, value in zip(points, objective.minus_log(points), strict=True):
         arw, drift, time, sigma, share, scale = np.exp(point)
@@ -128,10 +133,10 @@ CHAINS = States(sensors={"up": SensorStates(velocity_sigma=0.1, velocity_time=3.
     ids=["plain", "states", "chains"],
 )
 def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(states):
-    one, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
+    case, filter_setup = every_kind(), dataclasses.replace(KINDS, states=states)
     names = ("gyro.arw", "sun.sigma", "up.sigma", "north.sigma", "tracker.sigma")
-    plain = tuning.likelihood([one], chosen, names)
-    objective = tuning.contaminated_likelihood([one], chosen, names)
+    plain = tuning.likelihood([case], filter_setup, names)
+    objective = tuning.contaminated_likelihood([case], filter_setup, names)
     point = plain.start + 0.2
     none = np.concatenate([point, np.log([1e-13, 10.0])])
     assert objective.minus_log(none)[0] == pytest.approx(plain.minus_log(point)[0], rel=1e-9)
@@ -149,30 +154,32 @@ def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(state
     ],
 )
 def test_of_one_measurement_it_is_the_sum_of_both_likelihoods(kind, states):
-    whole, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
+    whole, filter_setup = every_kind(), dataclasses.replace(KINDS, states=states)
     series = whole.record.vectors[kind]
     # The others have no samples: the filter is that of every kind.
     vectors = tuple(each.taken(slice(9, 10) if each is series else slice(0)) for each in whole.record.vectors)
-    one = dataclasses.replace(whole, record=dataclasses.replace(whole.record, vectors=vectors))
+    case = dataclasses.replace(whole, record=dataclasses.replace(whole.record, vectors=vectors))
     name = f"{series.sensor}.sigma"
     if series.kind != "heading" and states is not None:
-        chosen = dataclasses.replace(chosen, sigma={series.sensor: (2e-2, 1e-2, 4e-2)})
-    plain = tuning.likelihood([one], chosen, [name])
+        filter_setup = dataclasses.replace(filter_setup, sigma={series.sensor: (2e-2, 1e-2, 4e-2)})
+    plain = tuning.likelihood([case], filter_setup, [name])
     narrow, wide = -plain.minus_log(np.array([plain.start, plain.start + np.log(7.0)]))
-    objective = tuning.contaminated_likelihood([one], chosen, [name], share=0.2, scale=7.0)
+    objective = tuning.contaminated_likelihood([case], filter_setup, [name], share=0.2, scale=7.0)
     expected = np.logaddexp(np.log(0.8) + narrow, np.log(0.2) + wide)
     assert -objective.minus_log(objective.start)[0] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.slow
 def test_noise_by_axis_that_is_the_same_for_all_axes_has_the_plain_mixture():
-    one, names = every_kind(), ("gyro.arw", "up.sigma", "tracker.sigma")
-    plain = tuning.contaminated_likelihood([one], KINDS, names, share=0.1)
-    chosen = dataclasses.replace(KINDS, sigma={name: (sigma,) * 3 for name, sigma in (("sun", 1e-2), ("up", 0.2))})
-    other = tuning.contaminated_likelihood([one], chosen, ("gyro.arw", "up.sigma.x", "tracker.sigma"), share=0.1)
+    case, names = every_kind(), ("gyro.arw", "up.sigma", "tracker.sigma")
+    plain = tuning.contaminated_likelihood([case], KINDS, names, share=0.1)
+    filter_setup = dataclasses.replace(
+        KINDS, sigma={name: (sigma,) * 3 for name, sigma in (("sun", 1e-2), ("up", 0.2))}
+    )
+    other = tuning.contaminated_likelihood([case], filter_setup, ("gyro.arw", "up.sigma.x", "tracker.sigma"), share=0.1)
     assert other.minus_log(other.start)[0] == pytest.approx(plain.minus_log(plain.start)[0], rel=1e-13)
-    for (_, found), (_, expected) in zip(other.judged(other.start), plain.judged(plain.start), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    for (_, probability), (_, expected) in zip(other.judged(other.start), plain.judged(plain.start), strict=True):
+        np.testing.assert_allclose(probability, expected, rtol=1e-9, atol=1e-12)
 
 
 GRADIENTS = {
@@ -187,41 +194,43 @@ GRADIENTS = {
     [pytest.param(*each, id=name, marks=pytest.mark.slow if each[0] else []) for name, each in GRADIENTS.items()],
 )
 def test_the_gradient_is_that_of_the_likelihood(states, names):
-    one, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
-    objective = tuning.contaminated_likelihood([one, one], chosen, names, threads=2)
+    case, filter_setup = every_kind(), dataclasses.replace(KINDS, states=states)
+    objective = tuning.contaminated_likelihood([case, case], filter_setup, names, threads=2)
     p = len(objective.start)
     point = objective.start + np.resize([0.2, -0.3, 0.1, 0.5, -0.3], p)
-    found = objective.derivatives(point)
+    derivatives = objective.derivatives(point)
     expected = differences(lambda x: objective.minus_log(x)[0], point)
-    most = 4.0 * innovations.STEP * np.maximum(np.diag(found.information), 1.0) + 1e-6
-    np.testing.assert_array_less(np.abs(found.score.sum(axis=0) - expected), most)
-    assert found.value.sum() == pytest.approx(objective.minus_log(point)[0], rel=1e-13)
-    np.testing.assert_allclose(found.information, found.information.T)
-    assert np.linalg.eigvalsh(found.information).min() > 0.0
+    most = 4.0 * innovations.STEP * np.maximum(np.diag(derivatives.information), 1.0) + 1e-6
+    np.testing.assert_array_less(np.abs(derivatives.score.sum(axis=0) - expected), most)
+    assert derivatives.value.sum() == pytest.approx(objective.minus_log(point)[0], rel=1e-13)
+    np.testing.assert_allclose(derivatives.information, derivatives.information.T)
+    assert np.linalg.eigvalsh(derivatives.information).min() > 0.0
 
 
 def correlated(duration: float) -> scenarios.Scenario:
     """Stars whose noise is in part correlated, with outliers."""
     faults = vectors.Faults(outlier_probability=0.05, outlier_scale=10.0, correlated_sigma=2e-4, correlation_time=20.0)
     plain = two_stars.scenario(duration)
-    return dataclasses.replace(plain, sensors=tuple(dataclasses.replace(one, faults=faults) for one in plain.sensors))
+    return dataclasses.replace(
+        plain, sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in plain.sensors)
+    )
 
 
 @pytest.mark.parametrize("states", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "states"])
 def test_the_information_is_the_scatter_of_the_score(states):
     """At the truth, over independent records: the collapse of the mixture to one normal costs little."""
-    chosen, free, made = BELIEVED, FREE, scenario(300.0)
+    filter_setup, free, star_scenario = BELIEVED, FREE, scenario(300.0)
     if states:
-        made = correlated(300.0)
-        chosen = dataclasses.replace(FilterSetup.for_scenario(made, states=True), attitude_sigma=1e-3)
+        star_scenario = correlated(300.0)
+        filter_setup = dataclasses.replace(FilterSetup.for_scenario(star_scenario, states=True), attitude_sigma=1e-3)
         free = ("star 1.sigma", "star 2.sigma", "star 1.correlated_sigma")
     scores, information = [], []
     for seed in range(40):
-        one = tuning.record_case(scenarios.simulate(made, seed), chosen, seed=seed)
-        objective = tuning.contaminated_likelihood([one], chosen, free, share=0.05, scale=10.0)
-        found = objective.derivatives(objective.start)
-        scores.append(found.score.sum(axis=0))
-        information.append(found.information)
+        case = tuning.record_case(scenarios.simulate(star_scenario, seed), filter_setup, seed=seed)
+        objective = tuning.contaminated_likelihood([case], filter_setup, free, share=0.05, scale=10.0)
+        derivatives = objective.derivatives(objective.start)
+        scores.append(derivatives.score.sum(axis=0))
+        information.append(derivatives.information)
     F, J = np.diag(np.mean(information, axis=0)), np.var(np.array(scores), axis=0)
     np.testing.assert_allclose(J / F, 1.0, atol=0.6)
     assert np.all(np.abs(np.mean(scores, axis=0)) < 3.5 * np.sqrt(F / len(scores)))
@@ -237,19 +246,21 @@ def recovered(seeds: int, duration: float) -> tuple[np.ndarray, np.ndarray, np.n
     errors, stated, inside, gates = [], [], [], []
     for seed in range(seeds):
         objective = tuning.contaminated_likelihood([case(seed, duration)], wrong, FREE)
-        found = tuning.fit(objective, starts=1)
-        gates.append(tuning.tuned_gate(objective, found))
-        errors.append(np.log([one.value for one in found.parameters] / truth))
-        stated.append([one.standard_error for one in found.parameters])
-        inside.append([one.lower <= x <= one.upper for one, x in zip(found.parameters, truth, strict=True)])
+        fit = tuning.fit(objective, starts=1)
+        gates.append(tuning.tuned_gate(objective, fit))
+        errors.append(np.log([parameter.value for parameter in fit.parameters] / truth))
+        stated.append([parameter.standard_error for parameter in fit.parameters])
+        inside.append(
+            [parameter.lower <= x <= parameter.upper for parameter, x in zip(fit.parameters, truth, strict=True)]
+        )
     return np.array(errors), np.array(stated), np.array(inside), gates
 
 
 def right_gate(duration: float) -> float:
     """The gate's probability at the truth."""
     objective = tuning.contaminated_likelihood([case(0, duration)], BELIEVED, FREE)
-    seen = outliers._noise_by_sensor(objective, np.log(TRUTH))
-    return float(outliers._probability(seen, np.array([[0.05, 10.0]]))[0][0])
+    noise = outliers._noise_by_sensor(objective, np.log(TRUTH))
+    return float(outliers._probability(noise, np.array([[0.05, 10.0]]))[0][0])
 
 
 def test_five_in_a_hundred_ten_times_as_wide_are_found_from_wrong_parameters():
@@ -258,10 +269,10 @@ def test_five_in_a_hundred_ten_times_as_wide_are_found_from_wrong_parameters():
     assert np.all(stated < [0.05, 0.2, 0.05, 0.03, 0.15, 0.1])
     assert inside.mean() >= 0.8
     right = right_gate(1200.0)
-    for found in gates:
-        assert found.lower < found.probability < found.upper
-        assert np.log((1.0 - found.probability) / (1.0 - right)) == pytest.approx(0.0, abs=0.5)
-        assert 11.0 < found.thresholds["star 1"] < 16.0
+    for gate in gates:
+        assert gate.lower < gate.probability < gate.upper
+        assert np.log((1.0 - gate.probability) / (1.0 - right)) == pytest.approx(0.0, abs=0.5)
+        assert 11.0 < gate.thresholds["star 1"] < 16.0
 
 
 @pytest.mark.slow
@@ -271,53 +282,53 @@ def test_five_in_a_hundred_over_60_records():
     assert np.all(rms < 1.25 * np.median(stated, axis=0)), (rms, np.median(stated, axis=0))
     assert np.all(inside.mean(axis=0) >= 0.85), inside.mean(axis=0)
     right = right_gate(1200.0)
-    assert np.mean([found.lower <= right <= found.upper for found in gates]) >= 0.85
+    assert np.mean([gate.lower <= right <= gate.upper for gate in gates]) >= 0.85
 
 
 def test_outliers_are_found_beside_correlated_noise_that_has_states():
-    made = correlated(600.0)
-    chosen = dataclasses.replace(FilterSetup.for_scenario(made, states=True), attitude_sigma=1e-3)
+    scenario = correlated(600.0)
+    filter_setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=True), attitude_sigma=1e-3)
     truth = {"star 1.sigma": 1e-4, "star 2.sigma": 2e-4}
-    wrong = tuning.with_values(chosen, {name: 2.0 * value for name, value in truth.items()})
-    one = tuning.record_case(scenarios.simulate(made, 4), chosen, seed=4)
-    found = tuning.tune([one], wrong, tuple(truth), starts=1, gate=True)
-    gate = found.gate
-    for parameter, right in zip(found.parameters, [*truth.values(), 0.05, 10.0], strict=True):
+    wrong = tuning.with_values(filter_setup, {name: 2.0 * value for name, value in truth.items()})
+    case = tuning.record_case(scenarios.simulate(scenario, 4), filter_setup, seed=4)
+    tuned = tuning.tune([case], wrong, tuple(truth), starts=1, gate=True)
+    gate = tuned.gate
+    for parameter, right in zip(tuned.parameters, [*truth.values(), 0.05, 10.0], strict=True):
         assert parameter.lower <= right <= parameter.upper, parameter
         assert parameter.standard_error < 0.2
     assert gate is not None
     assert gate.lower < gate.probability < gate.upper
-    assert found.setup.gate == gate.gate
+    assert tuned.setup.gate == gate.gate
 
 
 def test_where_there_is_none_there_is_no_gate():
     wrong = tuning.with_values(BELIEVED, WRONG)
     objective = tuning.contaminated_likelihood([case(1, 600.0, 0.0)], wrong, FREE)
-    found = tuning.fit(objective, starts=1)
-    assert not found["outliers.share"].identified
-    assert found["outliers.share"].upper < 0.03
-    gate = tuning.tuned_gate(objective, found)
+    fit = tuning.fit(objective, starts=1)
+    assert not fit["outliers.share"].identified
+    assert fit["outliers.share"].upper < 0.03
+    gate = tuning.tuned_gate(objective, fit)
     assert gate.gate is None
     assert np.isnan(gate.probability)
     # What is tuned beside it is what it is without.
     plain = tuning.fit(tuning.likelihood([case(1, 600.0, 0.0)], wrong, FREE), starts=1)
     for name in ("gyro.arw", "star 1.sigma", "star 2.sigma"):
-        assert abs(np.log(found[name].value / plain[name].value)) < 1.5 * plain[name].standard_error
+        assert abs(np.log(fit[name].value / plain[name].value)) < 1.5 * plain[name].standard_error
 
 
 def test_random_starts_stay_where_outliers_are_outliers():
     objective = tuning.contaminated_likelihood([case(2, 600.0)], tuning.with_values(BELIEVED, WRONG), FREE)
-    found = tuning.fit(objective, starts=4, intervals=False, factor=30.0)
-    assert found.agreeing == 4
+    fit = tuning.fit(objective, starts=4, intervals=False, factor=30.0)
+    assert fit.agreeing == 4
     low, high = np.log(outliers.SHARES)
-    assert np.all((found.starts[:, -2] >= low) & (found.starts[:, -2] <= high))
+    assert np.all((fit.starts[:, -2] >= low) & (fit.starts[:, -2] <= high))
 
 
 def test_at_the_threshold_an_outlier_is_as_likely_as_none():
     """Where the state is known: the densities of both, times how frequent they are, are equal there."""
     for degrees, share, scale in ((1, 0.05, 10.0), (2, 0.01, 5.0), (3, 0.2, 3.0)):
-        seen = {"star": outliers._SensorNoise(degrees=degrees, number=100, noise=1.0)}
-        (probability,), thresholds = outliers._probability(seen, np.array([[share, scale]]))
+        noise = {"star": outliers._SensorNoise(degrees=degrees, number=100, noise=1.0)}
+        (probability,), thresholds = outliers._probability(noise, np.array([[share, scale]]))
         e = np.zeros(degrees)
         e[0] = np.sqrt(thresholds["star"][0])
         inside = np.log(1.0 - share) + np.sum(norm.logpdf(e))
@@ -328,31 +339,31 @@ def test_at_the_threshold_an_outlier_is_as_likely_as_none():
 
 @pytest.mark.parametrize("states", [None, pytest.param(States(), marks=pytest.mark.slow)], ids=["lanes", "runs"])
 def test_the_share_of_its_own_noise_in_an_innovation_is_that_of_the_filter(states):
-    one = every_kind()
+    case = every_kind()
     objective = tuning.contaminated_likelihood(
-        [one], dataclasses.replace(KINDS, states=states), ("gyro.arw", "tracker.sigma")
+        [case], dataclasses.replace(KINDS, states=states), ("gyro.arw", "tracker.sigma")
     )
-    seen = outliers._noise_by_sensor(objective, objective.start[:-2])
-    estimate = setup.run(one.record, KINDS, one.initial)
-    for series in one.record.vectors:
+    noise = outliers._noise_by_sensor(objective, objective.start[:-2])
+    estimate = setup.run(case.record, KINDS, case.initial)
+    for series in case.record.vectors:
         own = series.sigma_axes if series.sigma_axes is not None else series.sigma[:, None]
         if series.kind == "vector":
             own = own / np.linalg.norm(series.references_f, axis=1)[:, None]
         share = np.mean(own**2 / estimate.innovations[series.sensor].variance)
         if series.kind != "heading":  # whose noise comes over the level part of its reference
-            assert seen[series.sensor].noise == pytest.approx(share, rel=1e-6)
-        assert 0.0 < seen[series.sensor].noise < 1.0
-        assert seen[series.sensor].number == len(estimate.innovations[series.sensor].time)
+            assert noise[series.sensor].noise == pytest.approx(share, rel=1e-6)
+        assert 0.0 < noise[series.sensor].noise < 1.0
+        assert noise[series.sensor].number == len(estimate.innovations[series.sensor].time)
 
 
 def test_the_gate_makes_the_filter_credible_on_data_held_out():
     (train,), test = tuning.split([case(1, 900.0)], 0.4)
     wrong = tuning.with_values(BELIEVED, WRONG)
     objective = tuning.contaminated_likelihood([train], wrong, FREE)
-    found = tuning.fit(objective, starts=1)
-    gate = tuning.tuned_gate(objective, found).gate
+    fit = tuning.fit(objective, starts=1)
+    gate = tuning.tuned_gate(objective, fit).gate
     assert gate is not None
-    after = dataclasses.replace(found.setup, gate=gate)
+    after = dataclasses.replace(fit.setup, gate=gate)
     compared = tuning.compare(test, wrong, after)
     assert compared.after.nis == pytest.approx(1.0, abs=0.12)
     assert compared.after.anees == pytest.approx(1.0, abs=0.5)
@@ -360,29 +371,29 @@ def test_the_gate_makes_the_filter_credible_on_data_held_out():
     assert compared.after.attitude_rms < compared.before.attitude_rms
     # Without outliers in the model σ answers for them.
     plain = tuning.fit(tuning.likelihood([train], wrong, FREE), starts=1)
-    assert plain["star 2.sigma"].value > 1.6 * found["star 2.sigma"].value
+    assert plain["star 2.sigma"].value > 1.6 * fit["star 2.sigma"].value
     # The likelihood of what is held out, of the mixture, is more than that of the best single normal.
-    likely = tuning.log_likelihood(test, objective, dataclasses.replace(found, setup=after))
+    likely = tuning.log_likelihood(test, objective, dataclasses.replace(fit, setup=after))
     assert likely > tuning.compare(test, wrong, plain.setup).after.log_likelihood + 0.05
 
 
 def test_so_many_outliers_are_none():
     objective = tuning.contaminated_likelihood([case(1)], BELIEVED, FREE)
-    found = tuning.fit(objective, starts=1, intervals=False)
+    fit = tuning.fit(objective, starts=1, intervals=False)
     many = tuple(
-        dataclasses.replace(one, value=0.39, identified=True) if one.name == "outliers.share" else one
-        for one in found.parameters
+        dataclasses.replace(parameter, value=0.39, identified=True) if parameter.name == "outliers.share" else parameter
+        for parameter in fit.parameters
     )
-    assert tuning.tuned_gate(objective, dataclasses.replace(found, parameters=many)).gate is None
+    assert tuning.tuned_gate(objective, dataclasses.replace(fit, parameters=many)).gate is None
 
 
 def test_a_gate_of_the_setup_keeps_what_else_it_says():
-    given = dataclasses.replace(BELIEVED, gate=Gate(probability=0.9, recovery=None))
-    objective = tuning.contaminated_likelihood([case(1, 300.0)], given, FREE[2:])
-    found = tuning.tuned_gate(objective, tuning.fit(objective, starts=1))
-    assert found.gate is not None
-    assert found.gate.recovery is None
-    assert found.gate.probability == found.probability != 0.9
+    filter_setup = dataclasses.replace(BELIEVED, gate=Gate(probability=0.9, recovery=None))
+    objective = tuning.contaminated_likelihood([case(1, 300.0)], filter_setup, FREE[2:])
+    gate = tuning.tuned_gate(objective, tuning.fit(objective, starts=1))
+    assert gate.gate is not None
+    assert gate.gate.recovery is None
+    assert gate.gate.probability == gate.probability != 0.9
 
 
 # -------------------------------------------------------------------------------------------------- the command line
@@ -396,13 +407,13 @@ def test_tune_with_a_gate_writes_it_into_the_filter(succeeds, tmp_path):
     assert "outliers.share" in said
     assert "is more likely an outlier than noise" in said
     content = json.loads(out.with_suffix(".json").read_text())
-    found = setup.read_setup(out)
-    assert found.gate is not None
-    assert found.gate.probability == pytest.approx(content["gate"]["probability"])
+    filter_setup = setup.read_setup(out)
+    assert filter_setup.gate is not None
+    assert filter_setup.gate.probability == pytest.approx(content["gate"]["probability"])
     assert content["gate"]["lower"] < content["gate"]["probability"] < content["gate"]["upper"]
     assert set(content["gate"]["thresholds"]) == {"star 1", "star 2"}
     page, _ = tunings.report(out.with_suffix(".json"))
     assert "A measurement with a NIS above" in page
-    one = case(1, 300.0)
-    estimate = setup.run(one.record, found, one.initial)
+    simulated_case = case(1, 300.0)
+    estimate = setup.run(simulated_case.record, filter_setup, simulated_case.initial)
     assert all(innovation.refused > 5 for innovation in estimate.innovations.values())

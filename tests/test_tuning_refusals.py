@@ -24,22 +24,22 @@ COMPASS = replace(
         vectors.Accelerometer(name="acc", sigma=0.05, rate=10.0, kind="vector"),
     ),
 )
-CHOSEN = setup.FilterSetup.for_scenario(COMPASS, states=False)
-HELD = drawn_case(COMPASS, CHOSEN, 1)
-AXES = replace(CHOSEN, sigma={"mag": (0.1, 0.1, 0.1)})
-OF_ANOTHER = replace(CHOSEN, states=States(sensors={"acd": SensorStates(bias_sigma=1.0)}))
-COLOURED = replace(CHOSEN, states=States(sensors={"acc": SensorStates(correlated_sigma=0.4, correlation_time=1.0)}))
+MATCHED = setup.FilterSetup.for_scenario(COMPASS, states=False)
+HELD = drawn_case(COMPASS, MATCHED, 1)
+AXES = replace(MATCHED, sigma={"mag": (0.1, 0.1, 0.1)})
+OF_ANOTHER = replace(MATCHED, states=States(sensors={"acd": SensorStates(bias_sigma=1.0)}))
+COLOURED = replace(MATCHED, states=States(sensors={"acc": SensorStates(correlated_sigma=0.4, correlation_time=1.0)}))
 STEADY = replace(BELIEVED, process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=0.0))
 UNSPECIFIED = {"gyro.arv": tuning.Prior(value=1.0, factor=2.0)}
 SPEC = gyro.GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
 
 
-def free(*names, of=ONE, chosen=BELIEVED):
-    return tuning.likelihood([of], chosen, names)
+def free(*names, of=ONE, filter_setup=BELIEVED):
+    return tuning.likelihood([of], filter_setup, names)
 
 
-def of_compass(*names, chosen=CHOSEN):
-    return free(*names, of=HELD, chosen=chosen)
+def of_compass(*names, filter_setup=MATCHED):
+    return free(*names, of=HELD, filter_setup=filter_setup)
 
 
 def mixed(**options):
@@ -57,7 +57,7 @@ TABLE = [
     (free, ("gyro.arw", "gyro.arw"), {}, "free names gyro.arw twice"),
     (free, ("star 3.sigma",), {}, "star 1.sigma"),
     (free, ("filter.scale", "gyro.arw"), {}, "tune it alone"),
-    (free, FREE, {"chosen": STEADY}, "gyro.rrw starts from 0"),
+    (free, FREE, {"filter_setup": STEADY}, "gyro.rrw starts from 0"),
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
     (tuning.values_of, (BELIEVED, ["star 1.sigma"], [SILENT]), {}, "sigma is 0"),
@@ -67,8 +67,8 @@ TABLE = [
     (of_compass, ("mag.sigma.x",), {}, r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"),
     (of_compass, ("acc.sigma", "acc.sigma.y"), {}, "acc.sigma.y is part of acc.sigma; give that, or the axes"),
     (of_compass, ("axc.sigma.x",), {}, "did you mean 'acc.sigma.x'"),
-    (of_compass, ("acc.correlated_time",), {"chosen": COLOURED}, "did you mean 'acc.correlation_time'"),
-    (of_compass, ("acd.bias_sigma",), {"chosen": OF_ANOTHER}, "did you mean 'acc'"),
+    (of_compass, ("acc.correlated_time",), {"filter_setup": COLOURED}, "did you mean 'acc.correlation_time'"),
+    (of_compass, ("acd.bias_sigma",), {"filter_setup": OF_ANOTHER}, "did you mean 'acc'"),
     (mixed, (), {"share": 0.6}, "share of the outliers is 0.6; it must lie between 0.0001 and 0.4"),
     (mixed, (), {"scale": 1.0}, "scale of the outliers is 1"),
     (two_gyros, (), {"angle_random_walk": 6e-5}, "angle_random_walk is 6e-05 and 3e-05"),
@@ -79,15 +79,15 @@ TABLE = [
 # fmt: on
 
 
-@pytest.mark.parametrize(("call", "given", "options", "named"), TABLE, ids=[row[3] for row in TABLE])
-def test_what_makes_no_sense_is_refused_by_name(call, given, options, named):
+@pytest.mark.parametrize(("call", "arguments", "options", "named"), TABLE, ids=[row[3] for row in TABLE])
+def test_what_makes_no_sense_is_refused_by_name(call, arguments, options, named):
     with pytest.raises(InputError, match=named):
-        call(*given, **options)
+        call(*arguments, **options)
 
 
 def test_what_is_near_it_is_taken():
     assert not any(name.startswith("mag") for name in tuning.parameters.axis_names([HELD.record]))
-    three = replace(CHOSEN, sigma={"acc": (0.05, 0.05, 0.1)})
+    three = replace(MATCHED, sigma={"acc": (0.05, 0.05, 0.1)})
     assert covariance.analyse(COMPASS, three, epochs=2).expected_nis["acc"] > 0.0
     assert tuning.parameters.own_sigma("star 2", [SILENT]) == pytest.approx(2e-4)
     two_gyros(turn_on_bias_sigma=1e-3, scale_factor=np.full(3, 1e-3))

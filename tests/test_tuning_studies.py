@@ -34,18 +34,18 @@ class Study:
 
 def study(walk: float, duration: float, seeds: int) -> Study:
     truth = np.array([1e-4, walk, 1e-4, 2e-4])
-    chosen = scenario(duration, walk=walk)
+    star_scenario = scenario(duration, walk=walk)
     right = dataclasses.replace(
         BELIEVED, process_noise=dataclasses.replace(BELIEVED.process_noise, rate_random_walk=walk)
     )
     wrong = tuning.with_values(right, dict(zip(FREE, truth * np.array([3.0, 3.0, 0.3, 3.0]), strict=True)))
     information, rows = [], []
     for seed in range(seeds):
-        one = tuning.record_case(scenarios.simulate(chosen, seed), right, seed=seed)
-        objective = tuning.likelihood([one], wrong, FREE)
+        case = tuning.record_case(scenarios.simulate(star_scenario, seed), right, seed=seed)
+        objective = tuning.likelihood([case], wrong, FREE)
         information.append(objective.derivatives(np.log(truth)).information)
-        found = tuning.fit(objective, starts=1)
-        rows.append([(p.value, p.most_likely, p.lower, p.upper, p.identified) for p in found.parameters])
+        fit = tuning.fit(objective, starts=1)
+        rows.append([(p.value, p.most_likely, p.lower, p.upper, p.identified) for p in fit.parameters])
     values = np.array(rows, float)
     inside = (values[:, :, 2] <= truth) & (truth <= values[:, :, 3])
     open_ended = values[:, 1, 4] == 0.0
@@ -60,34 +60,34 @@ def study(walk: float, duration: float, seeds: int) -> Study:
 
 
 def test_errors_reach_the_bound_and_intervals_cover():
-    found = study(3e-6, 1200.0, 16)
-    assert np.all(found.identified == 1.0)
-    assert np.all(found.rms < 1.7 * found.bound)
-    assert np.all(found.rms > 0.5 * found.bound)
-    assert np.all(found.coverage >= 0.75)
+    statistics = study(3e-6, 1200.0, 16)
+    assert np.all(statistics.identified == 1.0)
+    assert np.all(statistics.rms < 1.7 * statistics.bound)
+    assert np.all(statistics.rms > 0.5 * statistics.bound)
+    assert np.all(statistics.coverage >= 0.75)
 
 
 @pytest.mark.slow
 def test_errors_reach_the_bound_and_intervals_cover_over_200_records():
     """Issue G: RMS ≤ 1.15 of the bound, coverage of 95 % intervals from 91 to 98 %."""
-    found = study(3e-6, 2400.0, 200)
-    assert np.all(found.identified == 1.0)
-    assert np.all(found.rms <= 1.15 * found.bound), found
-    assert np.all((found.coverage >= 0.91) & (found.coverage <= 0.98)), found
+    statistics = study(3e-6, 2400.0, 200)
+    assert np.all(statistics.identified == 1.0)
+    assert np.all(statistics.rms <= 1.15 * statistics.bound), statistics
+    assert np.all((statistics.coverage >= 0.91) & (statistics.coverage <= 0.98)), statistics
 
 
 @pytest.mark.slow
 def test_a_noise_that_records_hardly_show_gets_a_bound_over_200_records():
     """Where the bound on the error of ln σ_u is 0.8, raw likelihood piles up at zero; what is put into the filter does not."""
-    found = study(5e-7, 600.0, 200)
-    assert 0.6 < found.bound[1] < 1.0
-    assert found.raw[1] > 3.0
-    assert found.rms[1] < found.bound[1]
-    assert found.identified[1] < 0.5
-    assert found.coverage_of_bounds >= 0.91
-    assert found.coverage[1] >= 0.91
+    statistics = study(5e-7, 600.0, 200)
+    assert 0.6 < statistics.bound[1] < 1.0
+    assert statistics.raw[1] > 3.0
+    assert statistics.rms[1] < statistics.bound[1]
+    assert statistics.identified[1] < 0.5
+    assert statistics.coverage_of_bounds >= 0.91
+    assert statistics.coverage[1] >= 0.91
     rest = [0, 2, 3]
-    assert np.all(found.rms[rest] <= 1.15 * found.bound[rest])
+    assert np.all(statistics.rms[rest] <= 1.15 * statistics.bound[rest])
 
 
 SCENARIOS = ("coning", "hand-held", "low-orbit", "magnetometer-only", "slew-vibration", "spin", "tumbling-satellite")
@@ -97,63 +97,63 @@ INTEGRATION = {"coning": "four-sample", "slew-vibration": "two-sample"}
 """Where the body vibrates; steps must end where the stars are seen, or the vibration between is taken for a straight line."""
 
 
-def without_unmodelled(chosen: scenarios.Scenario) -> scenarios.Scenario:
+def without_unmodelled(scenario: scenarios.Scenario) -> scenarios.Scenario:
     """The scenario with those errors alone that such a filter has parameters for: white noise, random walk, a turn-on bias."""
-    spec = chosen.gyro
+    spec = scenario.gyro
     plain = gyro.GyroSpec(
         angle_random_walk=spec.angle_random_walk,
         rate_random_walk=max(float(np.max(spec.rate_random_walk)), 1e-8),
         turn_on_bias_sigma=max(float(np.max(spec.turn_on_bias_sigma)), 1e-5),
     )
     sensors = []
-    for sensor in chosen.sensors:
+    for sensor in scenario.sensors:
         changes: dict[str, object] = {"faults": vectors.Faults(outages=sensor.faults.outages)}
         if isinstance(sensor, vectors.Magnetometer):
             changes.update(hard_iron=np.zeros(3), soft_iron=np.zeros((3, 3)))
         if isinstance(sensor, vectors.Accelerometer):
             changes.update(lever_arm_b=np.zeros(3), bias=np.zeros(3))
         sensors.append(dataclasses.replace(sensor, **changes))
-    return dataclasses.replace(chosen, gyro=plain, gyro_preset="", sensors=tuple(sensors))
+    return dataclasses.replace(scenario, gyro=plain, gyro_preset="", sensors=tuple(sensors))
 
 
-def tuned_from_wrong(chosen: scenarios.Scenario, records: int, factor: float) -> tuple[FilterSetup, FilterSetup]:
+def tuned_from_wrong(scenario: scenarios.Scenario, records: int, factor: float) -> tuple[FilterSetup, FilterSetup]:
     """Return the filter wrong by a factor, one parameter up and the next down, and what tuning on some records makes of it."""
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
-    if chosen.name in INTEGRATION:
-        filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
-    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
-    free = tuning.default_names([one.record for one in train])
-    values = tuning.values_of(filter_setup, free, [one.record for one in train])
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=False)
+    if scenario.name in INTEGRATION:
+        filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[scenario.name]])
+    train = [tuning.record_case(scenarios.simulate(scenario, 5, k), filter_setup, seed=k) for k in range(records)]
+    free = tuning.default_names([case.record for case in train])
+    values = tuning.values_of(filter_setup, free, [case.record for case in train])
     off = {name: value * (factor if k % 2 else 1.0 / factor) for k, (name, value) in enumerate(values.items())}
     wrong = tuning.with_values(filter_setup, off)
     return wrong, tuning.fit(tuning.likelihood(train, wrong, free), starts=2).setup
 
 
-def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.ndarray, np.ndarray]:
+def efficiencies(scenario: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return RMSE/√PCRB of a filter's attitude and bias at the epochs after the start, both predicted.
 
     The posterior Cramér–Rao bound is the Riccati recursion along the truth with the true noise; the RMSE that of the tuned filter's gains.
     """
-    right = dataclasses.replace(setup.FilterSetup.for_scenario(chosen, states=False), integration=tuned.integration)
-    bound = covariance.analyse(chosen, right, epochs=20).filter_covariance[1:]
-    actual = covariance.analyse(chosen, tuned, epochs=20).covariance[1:]
-    found = [
+    right = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), integration=tuned.integration)
+    bound = covariance.analyse(scenario, right, epochs=20).filter_covariance[1:]
+    actual = covariance.analyse(scenario, tuned, epochs=20).covariance[1:]
+    ratios = [
         np.sqrt(actual[:, part, part].trace(axis1=1, axis2=2) / bound[:, part, part].trace(axis1=1, axis2=2))
         for part in (slice(0, 3), slice(3, 6))
     ]
-    return found[0], found[1]
+    return ratios[0], ratios[1]
 
 
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
     """Issue G: RMSE/√PCRB ≤ 1.03, predicted; and what 150 runs have agrees with the prediction."""
-    chosen = scenario(600.0)
-    wrong, tuned = tuned_from_wrong(chosen, 1, 30.0)
-    assert np.min(efficiencies(chosen, wrong)) > 1.2
-    predicted = efficiencies(chosen, tuned)
+    star_scenario = scenario(600.0)
+    wrong, tuned = tuned_from_wrong(star_scenario, 1, 30.0)
+    assert np.min(efficiencies(star_scenario, wrong)) > 1.2
+    predicted = efficiencies(star_scenario, tuned)
     assert np.max(predicted) <= 1.03
-    bound = covariance.analyse(chosen, epochs=20).filter_covariance[1:]
-    (found,) = montecarlo.run(chosen, [tuned], runs=150, seed=3, epochs=20)
-    square = np.diagonal(found.mean_square_error[1:], axis1=1, axis2=2)
+    bound = covariance.analyse(star_scenario, epochs=20).filter_covariance[1:]
+    (statistics,) = montecarlo.run(star_scenario, [tuned], runs=150, seed=3, epochs=20)
+    square = np.diagonal(statistics.mean_square_error[1:], axis1=1, axis2=2)
     for part, ratio in zip((slice(0, 3), slice(3, 6)), predicted, strict=True):
         least = bound[:, part, part].trace(axis1=1, axis2=2)
         actual = np.sqrt(np.mean(square[:, part].sum(axis=1) / least))
@@ -164,9 +164,9 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound_in_every_scenario(name):
     """Four records, errors without a state taken out. The bias of ``slew-vibration`` hardly walks, and is known to 1.014 over time."""
-    chosen = without_unmodelled(scenarios.load_scenario(name))
-    wrong, tuned = tuned_from_wrong(chosen, 4, 30.0)
-    before, after = efficiencies(chosen, wrong), efficiencies(chosen, tuned)
+    scenario = without_unmodelled(scenarios.load_scenario(name))
+    wrong, tuned = tuned_from_wrong(scenario, 4, 30.0)
+    before, after = efficiencies(scenario, wrong), efficiencies(scenario, tuned)
     assert max(np.sqrt(np.mean(ratio**2)) for ratio in before) > 1.5
     assert np.max(after[0]) <= 1.03, after[0]
     assert np.sqrt(np.mean(after[1] ** 2)) <= 1.03, after[1]
@@ -176,12 +176,12 @@ def recorded(broad, files: slice) -> list[tuning.Case]:
     return [tuning.recording_case(read(path)) for path in sorted(broad.glob("*.hdf5"))[files]]
 
 
-def rmse(one: tuning.Case, chosen: FilterSetup) -> float:
+def rmse(case: tuning.Case, filter_setup: FilterSetup) -> float:
     """Total RMS error over what is to be judged of a trial, degrees."""
-    initial = setup.initial_state(chosen, one.initial.attitude)
-    estimate = setup.run(one.record, chosen, initial)
-    judged = one.judged & (estimate.time >= one.first) & (estimate.time <= one.last)
-    return reference_errors(estimate.attitude, one.true_attitude).rms(judged)["total"] / DEGREE
+    initial = setup.initial_state(filter_setup, case.initial.attitude)
+    estimate = setup.run(case.record, filter_setup, initial)
+    judged = case.judged & (estimate.time >= case.first) & (estimate.time <= case.last)
+    return reference_errors(estimate.attitude, case.true_attitude).rms(judged)["total"] / DEGREE
 
 
 def gain_of_scale(compared: tuning.Comparison) -> float:
@@ -197,12 +197,12 @@ def held_out_of_recordings(cases: list[tuning.Case]) -> None:
     filter_setup = tuning.recording_setup()
     assert filter_setup.attitude_sigma == AhrsParameters().attitude_sigma
     train, test = tuning.split(cases, 0.5)
-    found = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1)
-    assert found.misfit  # disturbances of a moving hand last: the fit says so
-    assert found["filter.scale"].upper < 1.0
-    compared = tuning.compare(test, filter_setup, found.setup)
+    fit = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1)
+    assert fit.misfit  # disturbances of a moving hand last: the fit says so
+    assert fit["filter.scale"].upper < 1.0
+    compared = tuning.compare(test, filter_setup, fit.setup)
     assert gain_of_scale(compared) > 0.0
-    before, after = (np.array([rmse(one, chosen) for one in test]) for chosen in (filter_setup, found.setup))
+    before, after = (np.array([rmse(case, candidate) for case in test]) for candidate in (filter_setup, fit.setup))
     np.testing.assert_allclose(after, before, rtol=1e-5)
     assert abs(np.log(compared.after.nis)) < abs(np.log(compared.before.nis))
 
@@ -221,11 +221,11 @@ def test_innovations_of_a_recording_tune_the_scale_alone_and_leave_no_sigma_too_
     """The worst of the eleven before (NEES 10), the slowest, and one with a magnet; all innovations would give the slowest 27."""
     filter_setup = tuning.recording_setup()
     names, spacing = tuning.by_innovations(None)
-    one = recorded(broad, slice(trial, trial + 1))
-    found = tuning.tune(one, filter_setup, names, spacing=spacing, starts=1).setup
-    after = tuning.compare(one, filter_setup, found).after
+    trials = recorded(broad, slice(trial, trial + 1))
+    tuned = tuning.tune(trials, filter_setup, names, spacing=spacing, starts=1).setup
+    after = tuning.compare(trials, filter_setup, tuned).after
     assert 0.02 < np.nanmean(after.nees[0].mean) < 1.0
-    np.testing.assert_allclose(rmse(one[0], found), rmse(one[0], filter_setup), rtol=1e-5)
+    np.testing.assert_allclose(rmse(trials[0], tuned), rmse(trials[0], filter_setup), rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -235,10 +235,10 @@ def test_recordings_tuned_on_half_of_the_trials_are_judged_on_the_others(broad):
     filter_setup = tuning.recording_setup()
     gains = []
     for train, test in ((cases[::2], cases[1::2]), (cases[1::2], cases[::2])):
-        found = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1).setup
-        gains.append(gain_of_scale(tuning.compare(test, filter_setup, found)))
+        tuned = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1).setup
+        gains.append(gain_of_scale(tuning.compare(test, filter_setup, tuned)))
         np.testing.assert_allclose(
-            [rmse(one, found) for one in test], [rmse(one, filter_setup) for one in test], rtol=1e-5
+            [rmse(case, tuned) for case in test], [rmse(case, filter_setup) for case in test], rtol=1e-5
         )
     assert gains[0] < -0.05
     assert gains[1] > 0.02

@@ -33,70 +33,70 @@ def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Sc
 
 
 def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
-    chosen = scenario(scale_factor)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
-    one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, name=f"record {seed}", seed=seed)
-    names = tuning.default_names([one.record])
-    return one, tuning.fit(tuning.likelihood([one], filter_setup, names), starts=1)
+    star_scenario = scenario(scale_factor)
+    filter_setup = setup.FilterSetup.for_scenario(star_scenario, states=False)
+    case = tuning.record_case(scenarios.simulate(star_scenario, seed), filter_setup, name=f"record {seed}", seed=seed)
+    names = tuning.default_names([case.record])
+    return case, tuning.fit(tuning.likelihood([case], filter_setup, names), starts=1)
 
 
 def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_size():
     doubted = 0
     for seed in (1, 2):
-        one, result = tuned(seed, 1e-3)
-        bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
-        found = tuning.unmodelled(bare, result.setup)
-        assert found.moves_with_the_rate
-        size = found.scale_factor
+        case, result = tuned(seed, 1e-3)
+        bare = dataclasses.replace(case, record=dataclasses.replace(case.record, truth=None))
+        unmodelled = tuning.unmodelled(bare, result.setup)
+        assert unmodelled.moves_with_the_rate
+        size = unmodelled.scale_factor
         assert np.all(np.abs(size.estimate - 1e-3) < 4.0 * size.standard_error)
         assert np.all(size.standard_error[:2] < 4e-4)
-        assert any("scale factor of the gyro" in words for words in found.words)
-        notes = {parameter.name: parameter.note for parameter in tuning.with_misfit_flag(result, found).parameters}
+        assert any("scale factor of the gyro" in words for words in unmodelled.words)
+        notes = {parameter.name: parameter.note for parameter in tuning.with_misfit_flag(result, unmodelled).parameters}
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
-        assert json.dumps(found.summary())
+        assert json.dumps(unmodelled.summary())
     assert doubted >= 1  # where the walk is called identified it is put in doubt
 
 
 def test_of_right_filters_hardly_one_is_suspected():
     suspected, gains = 0, []
     for seed in range(10, 14):
-        one, result = tuned(seed)
-        found = tuning.unmodelled(one, result.setup)
-        suspected += found.suspected
-        gains.append(found.scale_factor.gain)
-        if not found.suspected:
-            assert found.words == ()
-            assert tuning.with_misfit_flag(result, found) is result
+        case, result = tuned(seed)
+        unmodelled = tuning.unmodelled(case, result.setup)
+        suspected += unmodelled.suspected
+        gains.append(unmodelled.scale_factor.gain)
+        if not unmodelled.suspected:
+            assert unmodelled.words == ()
+            assert tuning.with_misfit_flag(result, unmodelled) is result
     assert suspected <= 1
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
 
 
 def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
-    one, result = tuned(1, 1e-3)
-    found = residual_checks.scale_factor(
-        setup.modelled_record(one.record, result.setup), result.setup.process_noise, one.initial
+    case, result = tuned(1, 1e-3)
+    scale_factor = residual_checks.scale_factor(
+        setup.modelled_record(case.record, result.setup), result.setup.process_noise, case.initial
     )
-    assert found.finding.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
+    assert scale_factor.finding.p_value == pytest.approx(3.0 * chi2.sf(scale_factor.gain, 3), rel=1e-9)
 
 
 def test_the_turns_are_those_of_the_body_without_its_bias():
-    one, result = tuned(4)
-    initial = setup.initial_state(result.setup, one.initial.attitude, one.initial.bias)
-    found = turning.turns(one.record, result.setup.process_noise, initial)
-    exact = scenario().motion.increments(one.record.time)
+    case, result = tuned(4)
+    initial = setup.initial_state(result.setup, case.initial.attitude, case.initial.bias)
+    turns = turning.turns(case.record, result.setup.process_noise, initial)
+    exact = scenario().motion.increments(case.record.time)
     late = slice(2000, -100)
-    assert np.std(found[late] - exact[late], axis=0).max() < 0.15 * np.std(exact, axis=0).max()
+    assert np.std(turns[late] - exact[late], axis=0).max() < 0.15 * np.std(exact, axis=0).max()
     # Of the noise hardly anything is left.
-    assert np.std((found - exact)[late]) < 0.3 * np.std((one.record.increments - exact)[late])
+    assert np.std((turns - exact)[late]) < 0.3 * np.std((case.record.increments - exact)[late])
 
 
 def test_the_turns_leave_out_a_large_bias():
-    chosen = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
-    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen, states=False), bias_sigma=1e-2)
-    one = tuning.record_case(scenarios.simulate(chosen, 1), filter_setup, seed=1)
-    found = turning.turns(one.record, filter_setup.process_noise, one.initial)
-    excess = (found - chosen.motion.increments(one.record.time))[2000:-100] * 10.0
+    biased = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(biased, states=False), bias_sigma=1e-2)
+    case = tuning.record_case(scenarios.simulate(biased, 1), filter_setup, seed=1)
+    turns = turning.turns(case.record, filter_setup.process_noise, case.initial)
+    excess = (turns - biased.motion.increments(case.record.time))[2000:-100] * 10.0
     assert np.abs(excess.mean(axis=0)).max() < 2e-4
 
 
@@ -119,85 +119,87 @@ def test_noise_explains_nothing(changes, seeds):
 
     Of 16 hours even what is left of it in an average over a few samples would seem a scale factor of several percent.
     """
-    chosen = dataclasses.replace(scenario(), **changes)
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
+    changed = dataclasses.replace(scenario(), **changes)
+    filter_setup = setup.FilterSetup.for_scenario(changed, states=False)
     for seed in seeds:
-        one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
-        found = residual_checks.scale_factor(one.record, filter_setup.process_noise, one.initial)
-        assert found.finding.p_value > 0.05
-        assert np.abs(found.estimate).max() < 5.0 * turning.PLAUSIBLE
-        assert changes is STILL or np.all(np.abs(found.estimate) < 3.0 * found.standard_error)
+        case = tuning.record_case(scenarios.simulate(changed, seed), filter_setup, seed=seed)
+        scale_factor = residual_checks.scale_factor(case.record, filter_setup.process_noise, case.initial)
+        assert scale_factor.finding.p_value > 0.05
+        assert np.abs(scale_factor.estimate).max() < 5.0 * turning.PLAUSIBLE
+        assert changes is STILL or np.all(np.abs(scale_factor.estimate) < 3.0 * scale_factor.standard_error)
 
 
 def test_a_walk_that_was_left_too_large_is_no_scale_factor():
-    one, result = tuned(4)
+    case, result = tuned(4)
     large = tuning.with_values(result.setup, {"gyro.rrw": 2e-6})
-    found = residual_checks.scale_factor(one.record, large.process_noise, one.initial)
-    assert found.finding.p_value > 0.05
+    scale_factor = residual_checks.scale_factor(case.record, large.process_noise, case.initial)
+    assert scale_factor.finding.p_value > 0.05
 
 
 def test_what_the_gate_refuses_is_left_out():
     faults = vectors.Faults(outlier_probability=0.05)
-    chosen = dataclasses.replace(
+    faulty = dataclasses.replace(
         scenario(), sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario().sensors)
     )
     filter_setup = dataclasses.replace(
-        setup.FilterSetup.for_scenario(chosen, states=False), gate=Gate(probability=0.999)
+        setup.FilterSetup.for_scenario(faulty, states=False), gate=Gate(probability=0.999)
     )
     suspected = 0
     for seed in range(2):
-        one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
-        found = tuning.unmodelled(one, filter_setup)
-        assert not {finding.name for finding in found.judgement.findings} & {"NIS", "normality"}
-        suspected += found.suspected
+        case = tuning.record_case(scenarios.simulate(faulty, seed), filter_setup, seed=seed)
+        unmodelled = tuning.unmodelled(case, filter_setup)
+        assert not {finding.name for finding in unmodelled.judgement.findings} & {"NIS", "normality"}
+        suspected += unmodelled.suspected
     assert suspected <= 1  # of two
-    estimate = setup.run(one.record, filter_setup, one.initial)
-    left = residual_checks.accepted(one.record, estimate)
-    for series, before in zip(left.vectors, one.record.vectors, strict=True):
+    estimate = setup.run(case.record, filter_setup, case.initial)
+    left = residual_checks.accepted(case.record, estimate)
+    for series, before in zip(left.vectors, case.record.vectors, strict=True):
         assert len(series.time) == len(before.time) - estimate.innovations[series.sensor].refused
         assert 0.02 < estimate.innovations[series.sensor].refused / len(before.time) < 0.06
 
 
 def test_a_cause_that_explains_more_goes_first():
-    one, result = tuned(1, 1e-3)
-    found = tuning.unmodelled(one, result.setup)
-    assert found.moves_with_the_rate
+    case, result = tuned(1, 1e-3)
+    unmodelled = tuning.unmodelled(case, result.setup)
+    assert unmodelled.moves_with_the_rate
     cause = Cause(
         name="hard iron",
         of="star 1",
         estimate=np.zeros(3),
         standard_error=np.zeros(3),
         unit="1",
-        gain=found.scale_factor.gain + 1.0,
+        gain=unmodelled.scale_factor.gain + 1.0,
         log_p=-100.0,
         words="star 1 has a hard iron",
     )
-    assert not dataclasses.replace(found, causes=(cause,)).moves_with_the_rate
-    assert dataclasses.replace(found, causes=(dataclasses.replace(cause, gain=1.0),)).moves_with_the_rate
+    assert not dataclasses.replace(unmodelled, causes=(cause,)).moves_with_the_rate
+    assert dataclasses.replace(unmodelled, causes=(dataclasses.replace(cause, gain=1.0),)).moves_with_the_rate
 
 
 def test_what_is_held_out_is_left_out():
-    one, _ = tuned(1)
-    (train,), _ = tuning.split([one], 0.4)
+    case, _ = tuned(1)
+    (train,), _ = tuning.split([case], 0.4)
     assert residual_checks.record_for_tuning(train).time[-1] == pytest.approx(540.0)
-    assert residual_checks.record_for_tuning(one) is one.record
+    assert residual_checks.record_for_tuning(case) is case.record
 
 
 def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
-    chosen = scenarios.load_scenario("low-orbit")
-    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
-    one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), filter_setup, seed=5)
-    found = tuning.unmodelled(one, filter_setup)
-    assert found.causes
-    assert found.causes[0].name == "hard iron"
-    assert not found.moves_with_the_rate
-    assert any("Most likely cause" in words for words in found.words)
+    scenario = scenarios.load_scenario("low-orbit")
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=False)
+    case = tuning.record_case(
+        scenarios.simulate(dataclasses.replace(scenario, duration=1200.0), 5), filter_setup, seed=5
+    )
+    unmodelled = tuning.unmodelled(case, filter_setup)
+    assert unmodelled.causes
+    assert unmodelled.causes[0].name == "hard iron"
+    assert not unmodelled.moves_with_the_rate
+    assert any("Most likely cause" in words for words in unmodelled.words)
 
 
 def test_the_command_reports_it_and_refuses_two_kinds(succeeds, refusal, tmp_path):
     first, second, out = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "tuned.toml"
-    chosen = scenario(1e-3)
-    recordfiles.write_record(first, scenarios.simulate(chosen, 2))
+    scaled = scenario(1e-3)
+    recordfiles.write_record(first, scenarios.simulate(scaled, 2))
     said = succeeds("tune", first, "--starts", 1, "-o", out)
     assert "scale factor of the gyro" in said
     assert "in doubt" in said
@@ -206,8 +208,8 @@ def test_the_command_reports_it_and_refuses_two_kinds(succeeds, refusal, tmp_pat
     np.testing.assert_allclose(finding["scale_factor"]["value"][:2], 1e-3, atol=1e-3)
     page, _ = tunings.report(out.with_suffix(".json"))
     assert "A scale factor of the gyro" in page
-    other = dataclasses.replace(chosen.gyro, angle_random_walk=6e-5)
-    brief = dataclasses.replace(chosen, gyro=other, duration=60.0)
+    other = dataclasses.replace(scaled.gyro, angle_random_walk=6e-5)
+    brief = dataclasses.replace(scaled, gyro=other, duration=60.0)
     record = dataclasses.replace(scenarios.simulate(brief, 1), origin=Origin(gyro=other))
     recordfiles.write_record(second, record)
     complaint = refusal("tune", first, second, "-o", tmp_path / "none.toml")

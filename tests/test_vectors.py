@@ -58,8 +58,8 @@ def test_without_noise_a_sensor_measures_its_reference_in_body_axes(sensor):
     if series.kind == "attitude":
         assert np.max(quaternion.angle_between(series.attitude, CONE.attitude(series.time))) < 1e-7
     elif sensor.name == "antennas":
-        seen, wanted = series.references_f, turn.apply(series.vector_b) * [1.0, 1.0, 0.0]
-        np.testing.assert_allclose(seen, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
+        reference, wanted = series.references_f, turn.apply(series.vector_b) * [1.0, 1.0, 0.0]
+        np.testing.assert_allclose(reference, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
     else:
         scale = np.linalg.norm(series.references_f, axis=1, keepdims=True)
         np.testing.assert_allclose(turn.apply(series.vector_b) / scale, series.references_f / scale, atol=1e-12)
@@ -271,9 +271,9 @@ def test_what_does_not_fit_the_samples_is_named(change, message):
 
 
 def test_one_sigma_of_an_attitude_is_that_about_each_axis():
-    one = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
-    np.testing.assert_array_equal(one.sigma_axes, np.full((5, 3), 0.01))
-    np.testing.assert_array_equal(one.sigma, np.full(5, 0.01))
+    constant = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
+    np.testing.assert_array_equal(constant.sigma_axes, np.full((5, 3), 0.01))
+    np.testing.assert_array_equal(constant.sigma, np.full(5, 0.01))
     each = 0.01 * np.arange(1.0, 6.0)
     varying = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": each})
     np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
@@ -286,32 +286,32 @@ def missing(kind, *, also):
     """A series of five samples of which two are missing, and what belongs to these too."""
     gone, value = np.array([False, True, False, False, True]), GOOD["vector_b"].copy()
     holes = np.where(gone, np.nan, 1.0)
-    given = {**(ATTITUDES if kind == "attitude" else GOOD), "kind": kind}
+    fields = {**(ATTITUDES if kind == "attitude" else GOOD), "kind": kind}
     if kind == "attitude":
-        given["attitude"] = ATTITUDES["attitude"] * np.stack([np.ones(5), holes, np.ones(5), np.ones(5)], axis=1)
+        fields["attitude"] = ATTITUDES["attitude"] * np.stack([np.ones(5), holes, np.ones(5), np.ones(5)], axis=1)
     else:
         value[:, 2] *= holes
-        given["vector_b"] = value
+        fields["vector_b"] = value
     noise = 0.1 * np.arange(1.0, 6.0)
-    given["sigma"] = noise
+    fields["sigma"] = noise
     if also in ("sigma", "everything") or kind == "heading":
-        given["sigma"] = noise * (holes if also else 1.0)
+        fields["sigma"] = noise * (holes if also else 1.0)
     if also in ("sigma_axes", "covariance") and kind != "heading":
         axes = noise[:, None] * [1.0, 2.0, 3.0]
         axes[gone, 1] = np.nan
-        given["sigma"] = np.zeros(5)
-        given[also] = axes if also == "sigma_axes" else axes[:, :, None] ** 2 * np.eye(3)
+        fields["sigma"] = np.zeros(5)
+        fields[also] = axes if also == "sigma_axes" else axes[:, :, None] ** 2 * np.eye(3)
     if also == "everything":
-        given["reference_f"] = np.array([[0.6, 0.8, 0.0]] * 5) * holes[:, None]
-        given["arrival"] = given["time"] + 0.1 * holes
-    return gone, given
+        fields["reference_f"] = np.array([[0.6, 0.8, 0.0]] * 5) * holes[:, None]
+        fields["arrival"] = fields["time"] + 0.1 * holes
+    return gone, fields
 
 
 @pytest.mark.parametrize("also", ["", "sigma", "sigma_axes", "covariance", "everything"])
 @pytest.mark.parametrize("kind", vectors.KINDS)
 def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
-    gone, given = missing(kind, also=also)
-    series = vectors.VectorMeasurements(**given)
+    gone, fields = missing(kind, also=also)
+    series = vectors.VectorMeasurements(**fields)
     content = series.attitude if kind == "attitude" else series.vector_b
     np.testing.assert_array_equal(np.isnan(content).any(axis=1), gone)
     known = series.taken(~gone)
@@ -340,10 +340,10 @@ def test_the_reference_of_a_missing_sample_is_that_of_the_only_one_there_is():
 @pytest.mark.parametrize("kind", vectors.KINDS)
 def test_a_series_may_be_missing_altogether(kind):
     missing = np.full((5, 3), np.nan)
-    given = {**GOOD, "vector_b": missing, "kind": kind, "sigma": missing[:, 0], "reference_f": missing}
+    fields = {**GOOD, "vector_b": missing, "kind": kind, "sigma": missing[:, 0], "reference_f": missing}
     if kind == "attitude":
-        given = {**given, "vector_b": np.empty((0, 3)), "attitude": np.full((5, 4), np.nan)}
-    series = vectors.VectorMeasurements(**given)
+        fields = {**fields, "vector_b": np.empty((0, 3)), "attitude": np.full((5, 4), np.nan)}
+    series = vectors.VectorMeasurements(**fields)
     assert np.isfinite(series.sigma).all()
     assert np.isfinite(series.references_f).all()
 
@@ -352,12 +352,12 @@ def test_a_series_may_be_missing_altogether(kind):
     ("make", "field", "value"),
     [
         *(
-            (VectorSensor, *one)
-            for one in (("rate", 0.0), ("sigma", -1.0), ("reference_f", [0.0, 0.0, 0.0]), ("kind", "attitude"))
+            (VectorSensor, *pair)
+            for pair in (("rate", 0.0), ("sigma", -1.0), ("reference_f", [0.0, 0.0, 0.0]), ("kind", "attitude"))
         ),
         *(
-            (Faults, *one)
-            for one in (
+            (Faults, *pair)
+            for pair in (
                 ("outages", [(2.0, 1.0)]),
                 ("outlier_probability", 1.5),
                 ("correlation_time", 0.0),
@@ -442,9 +442,9 @@ def test_the_axis_and_angles_of_headings_are_checked():
 def test_masked_measurements_are_missing_ones():
     vector = np.ma.masked_array(np.eye(3), mask=[[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     sigma = np.ma.masked_array([1e-3, 7.0, 1e-3], mask=[0, 1, 0])
-    found = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
-    np.testing.assert_array_equal(np.isnan(found.vector_b).all(axis=1), [False, True, False])
-    np.testing.assert_allclose(found.sigma, 1e-3)
+    series = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
+    np.testing.assert_array_equal(np.isnan(series.vector_b).all(axis=1), [False, True, False])
+    np.testing.assert_allclose(series.sigma, 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -495,18 +495,18 @@ def observed(kind, sigma, samples):
     field = vectors.Magnetometer(
         name="field", field_f=np.array([3.0, 0.0, 4.0]), sigma=5.0 * sigma, rate=10.0, kind=kind
     )
-    made = scenarios.Scenario(
+    scenario = scenarios.Scenario(
         motion=motion.ConstantRate(rate=(0.0, 0.0, 0.0)),
         gyro=GyroSpec(),
         sensors=(field,),
         rate=10.0,
         duration=samples / 10.0,
     )
-    record = scenarios.simulate(made, seed=11)
+    record = scenarios.simulate(scenario, seed=11)
     start = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-6, bias_sigma=1e-12)
     noise = estimation.ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
-    found = estimation.run(record, noise, start, every=samples).innovations["field"]
-    return float(np.mean(found.nis)) / found.innovation.shape[1], found.innovation.size
+    innovation = estimation.run(record, noise, start, every=samples).innovations["field"]
+    return float(np.mean(innovation.nis)) / innovation.innovation.shape[1], innovation.innovation.size
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.2])
@@ -518,11 +518,11 @@ def test_the_nis_of_directions_is_too_small_by_that_share_and_that_of_whole_vect
 
 def test_triads_of_several_vectors_are_those_of_each_whatever_its_length():
     several = np.random.default_rng(3).standard_normal((20, 3)) * np.geomspace(1e-3, 1e3, 20)[:, None]
-    np.testing.assert_allclose(triad(several), np.stack([triad(one) for one in several]), atol=1e-14)
+    np.testing.assert_allclose(triad(several), np.stack([triad(vector) for vector in several]), atol=1e-14)
 
 
 def test_a_baseline_is_one_vector():
-    given = {"name": "antennas", "sigma": 0.01, "rate": 4.0}
-    assert HeadingPair(baseline_b=[2, 0, 0], **given).baseline_b.dtype == np.float64
+    fields = {"name": "antennas", "sigma": 0.01, "rate": 4.0}
+    assert HeadingPair(baseline_b=[2, 0, 0], **fields).baseline_b.dtype == np.float64
     with pytest.raises(InputError, match=r"antennas: baseline_b has shape \(1, 3\), wanted \(3,\)"):
-        HeadingPair(baseline_b=[[2.0, 0.0, 0.0]], **given)
+        HeadingPair(baseline_b=[[2.0, 0.0, 0.0]], **fields)

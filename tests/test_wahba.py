@@ -86,10 +86,10 @@ def test_exact_data_give_the_exact_attitude() -> None:
         for n, decades, bound in ((2, 0.0, 3e-15), (3, 0.0, 3e-15), (7, 0.0, 3e-15), (4, 8.0, 1e-14)):
             r = geometry(rng, n)
             b = measured(q, r, 0.0, rng)
-            found = wahba.solve(b, r, 1e-6 * 10.0 ** rng.uniform(0.0, 0.5 * decades, n))
-            assert quaternion.angle_between(found.attitude, q) < bound
-            assert found.attitude[0] >= 0.0
-            assert found.chi_square < 1e-15
+            solution = wahba.solve(b, r, 1e-6 * 10.0 ** rng.uniform(0.0, 0.5 * decades, n))
+            assert quaternion.angle_between(solution.attitude, q) < bound
+            assert solution.attitude[0] >= 0.0
+            assert solution.chi_square < 1e-15
 
 
 def check_optimum(
@@ -97,11 +97,11 @@ def check_optimum(
 ) -> None:
     """One set of measurements against 60 digits: the attitude, and the loss where it has a bound."""
     b = measured(q, r, sigmas, rng)
-    found = wahba.solve(b, r, sigmas)
+    solution = wahba.solve(b, r, sigmas)
     best, loss = optimum(b, r, sigmas)
-    assert quaternion.angle_between(found.attitude, best) < bound
+    assert quaternion.angle_between(solution.attitude, best) < bound
     if of_loss:
-        np.testing.assert_allclose(found.loss, loss, **of_loss)
+        np.testing.assert_allclose(solution.loss, loss, **of_loss)
 
 
 def test_the_optimum_of_noisy_data_with_weights_over_eight_decades() -> None:
@@ -146,24 +146,25 @@ def test_batches_equal_single_sets(shape: tuple[int, ...]) -> None:
     r = geometry(rng, *shape, 4)
     sigmas = 10.0 ** rng.uniform(-5, -2, (*shape, 4))
     b = measured(q, r, sigmas, rng)
-    found = wahba.solve(b, r, sigmas)
-    assert (found.attitude.shape, found.covariance.shape, found.loss.shape) == ((*shape, 4), (*shape, 3, 3), shape)
+    solution = wahba.solve(b, r, sigmas)
+    shapes = (solution.attitude.shape, solution.covariance.shape, solution.loss.shape)
+    assert shapes == ((*shape, 4), (*shape, 3, 3), shape)
     for index in np.ndindex(shape):
-        one = wahba.solve(b[index], r[index], sigmas[index])
-        np.testing.assert_allclose(found.attitude[index], one.attitude, atol=2e-15)
+        single = wahba.solve(b[index], r[index], sigmas[index])
+        np.testing.assert_allclose(solution.attitude[index], single.attitude, atol=2e-15)
         np.testing.assert_allclose(
-            found.covariance[index], one.covariance, rtol=1e-9, atol=1e-9 * np.trace(one.covariance)
+            solution.covariance[index], single.covariance, rtol=1e-9, atol=1e-9 * np.trace(single.covariance)
         )
-        np.testing.assert_allclose(found.chi_square[index], one.chi_square, rtol=1e-9)
+        np.testing.assert_allclose(solution.chi_square[index], single.chi_square, rtol=1e-9)
 
 
 def test_one_catalogue_and_one_set_of_sigmas_serve_many_measurements() -> None:
     rng = np.random.default_rng(19)
     r, sigmas = geometry(rng, 3), np.array([1e-4, 1e-3, 1e-3])
     b = measured(quaternion.normalize(rng.standard_normal((6, 4))), np.broadcast_to(r, (6, 3, 3)), sigmas, rng)
-    found = wahba.solve(b, r, sigmas)
+    solution = wahba.solve(b, r, sigmas)
     for k in range(6):
-        np.testing.assert_allclose(found.attitude[k], wahba.solve(b[k], r, sigmas).attitude, atol=2e-15)
+        np.testing.assert_allclose(solution.attitude[k], wahba.solve(b[k], r, sigmas).attitude, atol=2e-15)
 
 
 def test_lengths_and_order_do_not_matter() -> None:
@@ -212,14 +213,14 @@ def test_covariance_and_residual_by_monte_carlo(sigmas: tuple[float, ...]) -> No
     count, n = 5000, len(sigmas)
     r = np.broadcast_to(geometry(rng, n), (count, n, 3))
     q = quaternion.normalize(rng.standard_normal((count, 4)))
-    found = wahba.solve(measured(q, r, np.array(sigmas), rng), r, sigmas)
-    whiteness(quaternion.log(quaternion.multiply(quaternion.conjugate(found.attitude), q)), found.covariance)
-    assert found.dof == 2 * n - 3
-    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], found.dof * count) / count
-    assert low < np.mean(found.chi_square) < high
+    solution = wahba.solve(measured(q, r, np.array(sigmas), rng), r, sigmas)
+    whiteness(quaternion.log(quaternion.multiply(quaternion.conjugate(solution.attitude), q)), solution.covariance)
+    assert solution.dof == 2 * n - 3
+    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], solution.dof * count) / count
+    assert low < np.mean(solution.chi_square) < high
     # Its probability is uniform: mean ½ and variance 1/12.
-    assert abs(np.mean(found.probability) - 0.5) < 4.5 / math.sqrt(12.0 * count)
-    np.testing.assert_allclose(found.probability, chi2.sf(2.0 * found.loss, found.dof), rtol=1e-12)
+    assert abs(np.mean(solution.probability) - 0.5) < 4.5 / math.sqrt(12.0 * count)
+    np.testing.assert_allclose(solution.probability, chi2.sf(2.0 * solution.loss, solution.dof), rtol=1e-12)
 
 
 def test_the_residual_shows_a_sigma_too_small() -> None:
@@ -248,9 +249,9 @@ def test_vertical_and_heading_for_any_attitude_and_dip(shape: tuple[int, ...]) -
         dip = rng.uniform(-1.4, 1.4, shape)
         field_f = 48.0 * np.stack([np.zeros(shape), np.cos(dip), -np.sin(dip)], axis=-1)
         up_b = quaternion.rotate(quaternion.conjugate(many), np.array([0.0, 0.0, 9.8]))
-        found = wahba.from_vertical_and_heading(up_b, quaternion.rotate(quaternion.conjugate(many), field_f))
-        assert found.shape == (*shape, 4)
-        assert np.max(quaternion.angle_between(found, many)) < 1e-14
+        attitude = wahba.from_vertical_and_heading(up_b, quaternion.rotate(quaternion.conjugate(many), field_f))
+        assert attitude.shape == (*shape, 4)
+        assert np.max(quaternion.angle_between(attitude, many)) < 1e-14
 
 
 def test_the_vertical_counts_most() -> None:

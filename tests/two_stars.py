@@ -50,9 +50,9 @@ def case(seed: int = 0, duration: float = 200.0, **changes: Any) -> tuning.Case:
     return tuning.record_case(scenarios.simulate(scenario(duration, **changes), seed), BELIEVED, seed=seed)
 
 
-def drawn_case(chosen: scenarios.Scenario, filter_setup: FilterSetup, seed: int, run: int = 0) -> tuning.Case:
+def drawn_case(scenario: scenarios.Scenario, filter_setup: FilterSetup, seed: int, run: int = 0) -> tuning.Case:
     """Return a run of a scenario with a start whose errors are drawn from the filter's own σ."""
-    record = scenarios.simulate(chosen, seed, run)
+    record = scenarios.simulate(scenario, seed, run)
     return tuning.Case(record=record, initial=start(record, filter_setup, seed, run), name=f"run {run}")
 
 

@@ -37,11 +37,13 @@ def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
         )
     ]
     if recording.magnetic_field is not None:
-        seen = ~np.isnan(recording.magnetic_field).any(axis=1)
-        topics.append((FIELD, stamps[seen], [stamps[seen], field_in("G", recording)[seen]]))
+        present = ~np.isnan(recording.magnetic_field).any(axis=1)
+        topics.append((FIELD, stamps[present], [stamps[present], field_in("G", recording)[present]]))
     if recording.true_attitude is not None:
-        seen = ~np.isnan(recording.true_attitude).any(axis=1)
-        topics.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
+        present = ~np.isnan(recording.true_attitude).any(axis=1)
+        topics.append(
+            (ATTITUDE, stamps[present], [outputs.to_ned(quaternion.normalize(recording.true_attitude[present]))])
+        )
     content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", int(stamps[0])), message("B", bytes(40))]
     for name, _, _ in topics:
         fields = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in _LAYOUTS[name])
