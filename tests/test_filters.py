@@ -242,7 +242,7 @@ def inverse_matrix(q):
 
 
 class SlowFilter:
-    """A filter of the family from nothing but what it calls the error: ``moved`` and ``seen``; all Jacobians are numeric.
+    """A filter of the family from nothing but what it calls the error: ``moved`` and ``error_of``; all Jacobians are numeric.
 
     ``moved(q, b, xi)`` is the state that lies the error xi (6,) from (q, b), ``error_of(q, b, q1, b1)`` the error of (q1, b1) near by. With
     ``resets`` the covariance is carried to the error about the corrected state, else it stays.
