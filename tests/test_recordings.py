@@ -225,7 +225,9 @@ def test_vectors_of_a_record_are_at_their_stamps():
         series_of("accelerometer", "vector", [1.0, 2.5, 4.0], [g, 2.0 * g, 3.0 * g], g, 0.01),
         series_of("magnetometer", "direction", [1.0], [[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 0.01),
     )
-    recording = recordings.from_record(ImuRecord(time=time, increments=np.ones((4, 3)), vectors=vectors))
+    record = ImuRecord(time=time, increments=np.ones((4, 3)), vectors=vectors, temperature=20.0 + time)
+    recording = recordings.from_record(record)
+    np.testing.assert_array_equal(recording.temperature, 20.0 + recording.time)
     none = np.full(3, np.nan)
     np.testing.assert_array_equal(recording.specific_force, [g, none, none, 3.0 * g])
     assert recording.magnetic_field is None
