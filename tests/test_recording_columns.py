@@ -78,6 +78,8 @@ def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
         read(path)
     with pytest.raises(InputError, match=r"stamps of timestamp are 2.5 apart.*not plausible in seconds"):
         read(table(header, values=VALUES[:, :7] * [2.5, 1, 1, 1, 1, 1, 1], name="slow.csv"))
+    with pytest.raises(InputError, match=r"stamps of timestamp are 4e-07 apart.*not plausible in seconds"):
+        read(table(header, values=VALUES[:, :7] * [4e-7, 1, 1, 1, 1, 1, 1], name="fast.csv"))
     recording = read(path, units={"time": "us"})
     np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
     np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])
