@@ -335,6 +335,21 @@ def test_an_event_is_described_by_its_kind(kind, words):
     assert text.endswith("ambiguous: then one was chosen.")
 
 
+def test_the_listing_of_a_record_has_the_rate_of_each_series():
+    star = VectorMeasurements(
+        sensor="star",
+        kind="direction",
+        time=[0.5, 1.5],
+        vector_b=[[0.0, 0.0, 1.0]] * 2,
+        reference_f=[0.0, 0.0, 1.0],
+        sigma=[0.1, 0.1],
+    )
+    record = ImuRecord(time=0.01 * np.arange(201.0), increments=np.zeros((200, 3)), vectors=(star,))
+    gyro, vectors = record.listing().cells
+    assert [gyro[0], *gyro[2:]] == ["gyro", "200", "100"]
+    assert [vectors[0], *vectors[2:]] == ["star", "2", "1"]
+
+
 def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
     """σ of 1, 2 and 3 ° in the first row, 4, 5 and 6 ° in the second, 7, 8 and 9 ° in the last; of the bias as many °/h."""
     sigma = np.arange(1.0, 10.0).reshape(3, 3)
