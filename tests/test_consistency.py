@@ -202,6 +202,8 @@ def test_ljung_box_of_several_components_is_hoskings():
     statistic, degrees, _ = consistency.ljung_box(z, 4)
     assert statistic == pytest.approx(150 * (150 + 2 / 3) * expected)
     assert degrees == 36
+    with pytest.raises(InputError, match="3 samples are too few for 1 lags of 3 components"):
+        consistency.ljung_box(np.random.default_rng(1).standard_normal((3, 3)), 1)
 
 
 def test_anderson_darling_by_the_sum():

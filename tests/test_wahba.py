@@ -341,3 +341,15 @@ def test_heading_refuses_a_vertical_field_and_free_fall() -> None:
         wahba.from_vertical_and_heading([0.0, 0.0, 0.0], [0.0, 0.01, -48.0])
     with pytest.raises(InputError, match=r"magnetic_b\[2\] is nan"):
         wahba.from_vertical_and_heading([0.0, 0.0, 9.8], [0.0, 0.01, np.nan])
+
+
+@pytest.mark.parametrize(("uncertainty", "determined"), [(0.99, True), (1.01, False)])
+def test_the_largest_uncertainty_is_one_radian(uncertainty: float, determined: bool) -> None:
+    """Of two directions α apart, the rotation about their bisector has the variance σ²/(2 sin²(α/2))."""
+    half, sigma = 0.05, uncertainty * np.sqrt(2.0) * np.sin(0.05)
+    pair = np.array([[np.cos(half), np.sin(half), 0.0], [np.cos(half), -np.sin(half), 0.0]])
+    if determined:
+        assert wahba.solve(pair, pair, [sigma, sigma]).covariance[0, 0] == pytest.approx(uncertainty**2, rel=1e-6)
+    else:
+        with pytest.raises(InputError, match=r"the 1σ of its least determined rotation is 1.01 rad"):
+            wahba.solve(pair, pair, [sigma, sigma])
