@@ -84,7 +84,8 @@ class AhrsParameters:
     tilt_share : float, default 0.3
         Reported variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion.
     heading_share, heading_by_field : float, default 1.0, 0.0
-        Reported variance of the heading relative to that of the filter: in a clean field, and in addition in such a field.
+        Reported variance of the heading relative to that of the filter: in a clean field, and in addition in such a field; in others the
+        addition follows the magnetometer's mean NIS with the power 5/4.
     gyro_scale_sigma : float, default 0.0
         σ of each of the gyro's scale factor errors, dimensionless, and misalignments, rad; 0: no states.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
