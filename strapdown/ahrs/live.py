@@ -130,7 +130,8 @@ class LiveAhrs:
         )
         first, weight = regions.FIRST_LEVEL
         a.field_level[0], a.field_sums[:] = first if magnetometer else 0.0, (first * weight, weight)
-        constants = headings.constants_of(parameters, max(parameters.step, self.interval))
+        step = max(parameters.step, self.interval)
+        constants = headings.constants_of(parameters, step)
         self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
         self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
         time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
@@ -146,13 +147,7 @@ class LiveAhrs:
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
             end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
-            compare=(
-                r(a.total),
-                r(a.number),
-                regions.slow_motion(max(parameters.step, self.interval)),
-                a.force_sums,
-                a.force_deviation,
-            ),
+            compare=(r(a.total), r(a.number), regions.slow_motion(step), a.force_sums, a.force_deviation),
             scale=(
                 r(a.field_level),
                 r(a.force_deviation),

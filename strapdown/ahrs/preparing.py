@@ -60,7 +60,7 @@ def prepare(
         turned = sensor_delays.gyro_attitude(recording)
     initial = starting.start(recording, turned, parameters)  # first, because it rejects a sensor without samples
     interval = recording.interval
-    edge = edges(recording.time, parameters.step, interval)
+    edge, step = edges(recording.time, parameters.step, interval), max(parameters.step, interval)
     time = recording.time[edge]
     assert recording.specific_force is not None
     total, number = sums(recording.specific_force, turned, edge)
@@ -92,7 +92,7 @@ def prepare(
             rows = kernel.Steps(
                 field, sampled, sampled * interval, middle, total, number, turned[edge[1:]], time[1:], variance
             )
-            heading = headings.online(rows, float(time[0]), parameters, max(parameters.step, interval))
+            heading = headings.online(rows, float(time[0]), parameters, step)
         else:
             samples = headings.FieldSteps(
                 field=field / np.maximum(sampled, 1.0)[:, None],
@@ -107,7 +107,7 @@ def prepare(
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    deviation = regions.gravity_deviation(total, number, max(parameters.step, interval))
+    deviation = regions.gravity_deviation(total, number, step)
     return Prepared(record, initial, edge, turned, deviation, heading)
 
 

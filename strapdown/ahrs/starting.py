@@ -125,7 +125,7 @@ def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> es
     """
     assert recording.specific_force is not None
     force = first_vector(recording.specific_force, turned, recording.source, "accelerometer")
-    across = np.eye(3)[np.argmin(np.abs(force))]
+    across = np.array(first_state.least_axis(force.tolist()))
     if recording.magnetic_field is not None:
         across = first_vector(recording.magnetic_field, turned, recording.source, "magnetometer")
     attitude, constants = wahba.from_vertical_and_heading(force, across), start_constants(parameters)
