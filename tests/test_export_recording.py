@@ -29,8 +29,7 @@ def case(name):
     """A filter that has not started, and samples: time, gyro, accelerometer, magnetometer; None: missing."""
     recording = with_missing(swinging(duration=12.0))
     if name == "white":
-        shares = {"tilt_sigma": 0.02, "tilt_by_field": 0.3, "heading_share": 0.1, "heading_by_field": 1.0}
-        parameters = AhrsParameters(rest_bias_sigma=1e-3, hard_iron_sigma=0.0, **shares)
+        parameters = AhrsParameters(rest_bias_sigma=1e-3, hard_iron_sigma=0.0)
         live = LiveAhrs(interval=0.01, magnetometer=True, parameters=parameters)
         turned = quaternion.conjugate(sensor_delays.gyro_attitude(recording))
         field = quaternion.rotate(turned, [0.0, 20.0, -43.0]) + np.array([4.0, -2.0, 1.0])

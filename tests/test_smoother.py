@@ -305,9 +305,6 @@ def test_last_state_is_the_filters() -> None:
     for sensor, innovations in filtered.innovations.items():
         np.testing.assert_array_equal(smoothed.innovations[sensor].whitened, innovations.whitened)
         np.testing.assert_array_equal(smoothed.innovations[sensor].time, innovations.time)
-    again, attitude = estimation.smoothed_and_filtered(record, case.noise, initial, (), forward.Options())
-    np.testing.assert_array_equal(again.attitude, smoothed.attitude)
-    np.testing.assert_allclose(attitude, filtered.attitude, atol=1e-14)
 
 
 def test_without_measurements_it_is_the_filter() -> None:

@@ -27,7 +27,6 @@ from strapdown.ahrs.starting import (
 )
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
-from strapdown.estimation.forward import Options
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
@@ -56,9 +55,9 @@ class AhrsEstimate:
     recording : Recording
         The recording, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording. The covariance follows the disturbance of the field up to each stamp
+        Attitude and gyro bias at the stamps of the recording. The covariance follows what the innovations up to each stamp show
         (:mod:`strapdown.ahrs.regions`), the variance of the accelerometer's innovations the level of the acceleration; the covariance
-        includes timing errors and constant iron, which the filter does not estimate.
+        includes timing errors, constant iron and an error of the accelerometer, which the filter does not estimate.
     record : ImuRecord
         Input of the filter: increments and vectors averaged over its steps.
     initial : State
@@ -156,8 +155,8 @@ def estimate(
     else:
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
-    filtered, disagreement = _run(prepared, parameters, faults.turn_variance, at_rest, options)
-    scales = regions.scales(filtered, prepared.deviation, parameters, disagreement=disagreement)
+    filtered = _run(prepared, parameters, faults.turn_variance, at_rest, options)
+    scales = regions.scales(filtered, parameters, max(parameters.step, used.interval), causal=not smooth)
     at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
@@ -194,8 +193,8 @@ class _Options(NamedTuple):
 
 def _run(
     prepared: Prepared, parameters: AhrsParameters, turn_variance: Array, at_rest: Rests, options: _Options
-) -> tuple[Estimate, float | None]:
-    """Return the filter's or the smoother's estimate at the steps, and the smoother's disagreement with its filter.
+) -> Estimate:
+    """Return the filter's or the smoother's estimate at the steps.
 
     The record is run in parts. Before each uncertain rotation (:func:`uncertain_turns`) its variance is added to that of the attitude; the
     parts between are smoothed separately, because samples after an unknown rotation have little information about the attitude before it.
@@ -223,24 +222,22 @@ def _run(
         spans = [estimation.Span(last, functools.partial(changed, edge=last)) for last in bounds[1:]]
         online = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
-        return replace(online, events=tuple(event for event in online.events if event.kind != "gap")), None
-    shared = Options(full_covariance=True, error_state_covariance=False, **judged)
+        return replace(online, events=tuple(event for event in online.events if event.kind != "gap"))
     parts: list[Estimate] = []
-    forward: list[Array] = []
     for first, last in itertools.pairwise(bounds):
         part = record if len(bounds) == 2 else cut(record, first, last)
         for _ in range(MAX_STARTS):
-            smoothed, filtered = estimation.smoothed_and_filtered(part, own.process_noise, state, blocks, shared)
+            smoothed = estimation.smooth(
+                part, own.process_noise, state, blocks, full_covariance=True, error_state_covariance=False, **judged
+            )
             if quaternion.angle_between(smoothed.attitude[0], state.attitude) < FAR_START:
                 break
             state = replace(state, attitude=smoothed.attitude[0])
         parts.append(smoothed)
-        forward.append(filtered if not forward else filtered[1:])
         if last < bounds[-1]:
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
             state = changed(state, last)
-    whole = joined(parts)
-    return whole, regions.disagreement(whole.attitude, np.concatenate(forward))
+    return joined(parts)
 
 
 def uncertain_turns(variance: Array) -> Array:
@@ -258,7 +255,7 @@ def uncertain_turns(variance: Array) -> Array:
 
 def _at_stamps(
     filtered: Estimate,
-    scales: tuple[Array, Array, Array],
+    scales: tuple[Array, Array],
     used: Recording,
     prepared: Prepared,
     parameters: AhrsParameters,

@@ -128,9 +128,14 @@ class LiveAhrs:
                 for name, (shape, kind, _) in table.items()
             }
         )
-        first, weight = regions.FIRST_LEVEL
-        a.field_level[0], a.field_sums[:] = first if magnetometer else 0.0, (first * weight, weight)
         step = max(parameters.step, self.interval)
+        intervals = step, parameters.heading_interval
+        a.force_density[0], a.field_density[0] = (
+            regions.FIRST_DENSITY[0],
+            regions.FIRST_DENSITY[0] if magnetometer else 1.0,
+        )
+        a.force_averages[:], a.field_averages[:] = map(regions.first_memory, (2, 1), intervals)
+        of_force, of_field = map(regions.averages, intervals)
         constants = headings.constants_of(parameters, step)
         self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
         self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
@@ -138,7 +143,7 @@ class LiveAhrs:
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
         estimate = [np.ones(shape) for shape in ((1, 4), (1, 3), (1, 6), (1, 6, 6))]
         r = read_only
-        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.floor, a.heading, a.iron_variance)))
+        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
         stamps = Stamps(*map(r, (a.times, a.rates, a.turns, np.full(2, late), a.ahead)))
         of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
         heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
@@ -147,19 +152,18 @@ class LiveAhrs:
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
             end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
-            compare=(r(a.total), r(a.number), regions.slow_motion(step), a.force_sums, a.force_deviation),
+            judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
             scale=(
-                r(a.field_level),
-                r(a.force_deviation),
-                regions.shares_of(parameters, magnetometer=magnetometer),
+                r(a.force_density),
+                r(a.field_density),
+                regions.scales_of(parameters, magnetometer=magnetometer),
                 a.tilt,
-                a.floor,
                 a.heading,
             ),
             carry=(at_step, stamps, regions.limits(parameters, delay_sigma), self._found),
             average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
             head=(constants, headings.kernel.Steps(*map(r, of_step)), self._memory, headings.kernel.Outputs(*heading)),
-            field_mean=(r(a.nis), parameters.heading_interval / regions.FIELD_MEMORY, a.field_sums, a.field_level),
+            judge_field=(r(a.field_innovation), of_field, a.field_averages, a.field_density),
             watch=(
                 starting.constants_of(self.interval, parameters),
                 *map(r, (time, gyro, force, field if magnetometer else field[:0])),

@@ -73,19 +73,11 @@ class AhrsParameters:
     accelerometer_bias_sigma : float, default 0.0
         σ of a constant bias of the accelerometer, each component, m/s²; 0: no states. The smoother replaces it by the difference between
         the specific force at rest and gravity if that is larger than 0.1 m/s².
-    tilt_sigma : float, default 0.0
-        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated. The filter's
-        has in addition the deviation of the specific force from gravity in slow motion so far (:mod:`strapdown.ahrs.regions`), the
-        smoother's the difference between its tilt and its filter's.
-    tilt_by_field, max_tilt_by_field : float, default 0.0
-        σ of a further such error, m/s², where the field is disturbed as along the path of a phone indoors
-        (:mod:`strapdown.ahrs.regions`), and its maximum in fields that are disturbed more: the units that are carried so are those of
-        phones.
-    tilt_share : float, default 0.3
-        Reported variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion.
-    heading_share, heading_by_field : float, default 1.0, 0.0
-        Reported variance of the heading relative to that of the filter: in a clean field, and in addition in such a field; in others the
-        addition follows the magnetometer's mean NIS with the power 5/4.
+    tilt_sigma : float, default 0.04
+        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
+    tilt_scale, heading_scale : float, default 5.0, 3.5
+        Reported variance of tilt and heading relative to that of the filter if the innovations of the accelerometer or of the magnetometer
+        are white; in others it follows their spectral density at low frequency with the power 5/4 (:mod:`strapdown.ahrs.regions`).
     gyro_scale_sigma : float, default 0.0
         σ of each of the gyro's scale factor errors, dimensionless, and misalignments, rad; 0: no states.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
@@ -113,12 +105,9 @@ class AhrsParameters:
     position_time: float = 0.0
     usual_variation: float = 0.0
     accelerometer_bias_sigma: float = 0.0
-    tilt_sigma: float = 0.0
-    tilt_by_field: float = 0.0
-    max_tilt_by_field: float = 0.0
-    tilt_share: float = 0.3
-    heading_share: float = 1.0
-    heading_by_field: float = 0.0
+    tilt_sigma: float = 0.04
+    tilt_scale: float = 5.0
+    heading_scale: float = 3.5
     gyro_scale_sigma: float = 0.0
     gyro_temperature_sigma: float | tuple[float, ...] = 0.0
 
@@ -129,12 +118,9 @@ class AhrsParameters:
             "gyro_scale_sigma",
             "hard_iron_sigma",
             "iron_sigma",
-            "heading_by_field",
-            "max_tilt_by_field",
             "position_time",
             "rate_random_walk",
             "rest_bias_sigma",
-            "tilt_by_field",
             "tilt_sigma",
             "usual_variation",
             "velocity_sigma",
@@ -186,12 +172,7 @@ HAND_HELD = AhrsParameters(
     velocity_sigma=0.7,
     acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_sigma=0.042,
-    tilt_by_field=0.25,
-    max_tilt_by_field=0.38,
-    tilt_share=0.05,
-    heading_share=0.03,
-    heading_by_field=0.65,
+    tilt_scale=12.5,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
@@ -204,10 +185,9 @@ HAND_HELD_SMOOTHED = replace(
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
-    tilt_sigma=0.054,
-    tilt_by_field=0.08,
-    max_tilt_by_field=0.165,
-    heading_by_field=0.95,
+    tilt_sigma=0.05,
+    tilt_scale=20.0,
+    heading_scale=2.4,
     gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
@@ -222,8 +202,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     velocity_time=1.0,
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
-    tilt_sigma=0.045,
-    tilt_share=0.2,
+    tilt_scale=5.0,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown import estimation
-from strapdown.ahrs import headings, regions, starting
+from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.gyro.temperature import BiasOverTemperature
@@ -34,8 +34,6 @@ class Prepared(NamedTuple):
     """Sample at which each step ends, preceded by the first sample (k + 1,)."""
     turned: Array
     """Attitude from the gyro only at every sample, identity at the first one (n, 4)."""
-    deviation: Array
-    """Mean square deviation of the specific force from gravity up to each edge of the steps (k + 1,), (m/s²)²."""
     field: headings.Headings | None
     """What was found of the field; None without a magnetometer."""
 
@@ -107,8 +105,7 @@ def prepare(
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    deviation = regions.gravity_deviation(total, number, step)
-    return Prepared(record, initial, edge, turned, deviation, heading)
+    return Prepared(record, initial, edge, turned, heading)
 
 
 def without_temperature(

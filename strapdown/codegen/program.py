@@ -222,6 +222,10 @@ def update(f: Any, sensor: Sensor, value: Any, sigma: Any = 0) -> Any:
     if not sound:
         return BAD_INPUT
     f.nis[f.program.sensors.index(sensor)] = g.nis
+    if f.program.recording is not None:
+        last = f.program.recording.last_innovations(f, sensor)
+        for i in range(min(len(g.errors), 2)):
+            last[0, i] = g.errors[i] / square_root(g.variances[i])
     if f.program.thresholds is not None:
         accepted = g.nis <= f.program.thresholds[degrees_of_freedom(sensor.kind) - 1]
         if sensor.kind == DIRECTION:

@@ -69,7 +69,7 @@ class Recording:
     @property
     def lasting(self) -> dict[str, np.ndarray]:
         """Arrays of Python that last from one sample to the next, by name."""
-        of_field = "field", "field_level", "field_sums"
+        of_field = "field", "field_innovation", "field_density", "field_averages"
         arrays = {
             name: getattr(self.imu.arrays, name)
             for name in live_imu.LASTING
@@ -77,6 +77,11 @@ class Recording:
         }
         arrays |= self.field._asdict() if self.magnetometer else {}
         return arrays | (self.rest._asdict() if self.imu.rests else {})
+
+    @staticmethod
+    def last_innovations(f: Any, sensor: body.Sensor) -> Any:
+        """Return the array of the filter ``f`` for the last innovations of a sensor over their σ (1, m)."""
+        return f.force_innovation if sensor is f.program.sensors[0] else f.field_innovation
 
     @property
     def arrays(self) -> tuple[Array, ...]:
@@ -156,15 +161,17 @@ def init(f: Any) -> Any:
     for i in range(6):
         f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
-    for array in (f.force_deviation, f.force_sums):
-        for i in range(len(array)):
-            array[i] = 0
+    judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
+    if r.magnetometer:
+        judged.append((f.field_density, f.field_averages, r.imu.arrays.field_averages))
+    for density, averages, at_start in judged:
+        density[0] = regions.FIRST_DENSITY[0]
+        for i, value in enumerate(at_start.tolist()):
+            averages[i] = value
     if r.magnetometer:
         for array in (f.counted, f.sums, f.iron, f.total, f.start):
             for i in range(len(array)):
                 array[i] = 0
-        level, weight = regions.FIRST_LEVEL
-        f.field_level[0], f.field_sums[0], f.field_sums[1] = level, level * weight, weight
     if r.imu.rests:
         rests.clear_span(f)
         f.resting[1] = 0
@@ -249,12 +256,13 @@ def predict_filter(imu: Any, turn: Any) -> None:
     body.propagate(f, (turn[0, 0], turn[0, 1], turn[0, 2]), f.clock[0] - f.clock[1])
 
 
-def update_filter(imu: Any, index: int, vector: Any, sigma: Any) -> Any:
-    """Update the filter with a vector of a sensor; return its NIS, 0 if it was not used."""
+def update_filter(imu: Any, index: int, vector: Any, sigma: Any, normalized: Any) -> None:
+    """Update the filter with a vector of a sensor; write the innovations over their σ (1, m), 0 if they were not used."""
     f = imu.filter
     sensor = f.program.sensors[index]
-    status = body.update(f, sensor, (vector[0, 0], vector[0, 1], vector[0, 2]), sigma / sensor.length)
-    return f.nis[index] if status == body.OK else 0.0
+    for i in range(2 - index):
+        normalized[0, i] = 0.0
+    body.update(f, sensor, (vector[0, 0], vector[0, 1], vector[0, 2]), sigma / sensor.length)
 
 
 def show_filter(imu: Any) -> None:

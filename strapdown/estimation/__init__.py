@@ -32,7 +32,6 @@ from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
 from strapdown.estimation.smoothing import smooth
-from strapdown.estimation.smoothing import smoothed_and_filtered as smoothed_and_filtered
 from strapdown.estimation.states import ProcessNoise, State, first_state, initial_state
 
 __all__ = [

@@ -90,34 +90,26 @@ def smooth(
     Memory for the filter's states: 256 bytes per gyro interval and per measurement; with error states 8 (n (n + 1)/2 + n + 5), for n states
     in total.
     """
-    options = Options(
-        full_covariance=full_covariance, error_state_covariance=error_state_covariance, gate=gate, robust=robust
-    )
-    return smoothed_and_filtered(record, process_noise, initial, error_states, options)[0]
-
-
-def smoothed_and_filtered(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    error_states: Sequence[ErrorStates],
-    options: Options,
-) -> tuple[Estimate, Array]:
-    """Return the smoother's estimate at every edge of a record, and the filter's attitude there (edges, 4)."""
     problem = forward.prepared(record, process_noise, initial, error_states)
-    options = replace(options, every=len(record.time))
+    options = Options(
+        every=len(record.time),
+        full_covariance=full_covariance,
+        error_state_covariance=error_state_covariance,
+        gate=gate,
+        robust=robust,
+    )
     if not problem.model.states:
-        estimate, filtered = _Smoother(problem, options, _SixStates(problem)).smoothed()
+        estimate = _Smoother(problem, options, _SixStates(problem)).smoothed()
         if _digits_kept(problem, estimate):
-            return estimate, filtered
-    estimate, filtered = _Smoother(problem, options, _ManyStates(problem)).smoothed()
+            return estimate
+    estimate = _Smoother(problem, options, _ManyStates(problem)).smoothed()
     lost = _digits_lost(problem, estimate)
     if lost is not None:
         raise InputError(
             f"the smoothed variances at {record.time[lost]:g} s have no digits left: the attitude of the start is known too well for the "
             "uncertainty of its bias; raise the smaller sigma"
         )
-    return estimate, filtered
+    return estimate
 
 
 def _digits_kept(problem: Problem, estimate: Estimate) -> bool:
@@ -168,8 +160,8 @@ class _Smoother:
     options: Options
     form: _SixStates | _ManyStates
 
-    def smoothed(self) -> tuple[Estimate, Array]:
-        """Return the estimate at every edge, and the filter's attitude there (edges, 4)."""
+    def smoothed(self) -> Estimate:
+        """Return the estimate at every edge."""
         record = self.problem.record
         estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
         event_time = self.problem.events.time
@@ -183,13 +175,12 @@ class _Smoother:
             self._across_recoveries(*self._reruns(recovered, event_time, segments), segments, outputs)
         else:
             self.form.go_back(segments, starts, 0, outputs)
-        smoothed = replace(
+        return replace(
             self.form.estimate(outputs, self.options),
             innovations=estimate.innovations,
             skipped=estimate.skipped,
             events=estimate.events,
         )
-        return smoothed, segments[starts, 4:8]
 
     def _across_recoveries(
         self, breaks: Sequence[Break], reruns: Sequence[Rerun], segments: Array, outputs: Sequence[Array]

@@ -19,8 +19,7 @@ from strapdown.kernels.recording_steps import (
     carry_to_stamps,
     end_steps,
     follow_gyro,
-    gravity_deviation,
-    running_mean,
+    innovation_density,
     scale_factors,
 )
 from strapdown.kernels.rests import find_rests
@@ -39,15 +38,16 @@ LASTING = {
     "turned": ((4,), "", "attitude by the gyro alone, since the start"),
     "force": ((MOST, 3), "", "specific force at the samples of this step"),
     "frame": ((MOST, 4), "", "attitude by the gyro at its start and at its samples"),
-    "force_deviation": ((1,), "", "mean square deviation of the specific force from gravity in slow motion, (m/s^2)^2"),
-    "force_sums": ((7,), "", "its sums"),
+    "force_innovation": ((1, 2), "", "last level innovations of the accelerometer over their sigma"),
+    "force_density": ((1,), "", "density of the accelerometer's innovations at low frequency"),
+    "force_averages": ((5,), "", "its averages and sums"),
     "tilt": ((1,), "", "factor on sigma of the tilt"),
-    "floor": ((1,), "", "variance that is added to that of the tilt, rad^2"),
     "heading": ((1,), "", "factor on sigma of the heading"),
     "iron_variance": ((1,), "", "variance that is added to that of the heading, rad^2"),
     "field": ((MOST, 3), "", "field at the samples of this step"),
-    "field_level": ((1,), "", "mean nis of the magnetometer"),
-    "field_sums": ((2,), "", "its sums"),
+    "field_innovation": ((1, 1), "", "last innovation of the heading over its sigma"),
+    "field_density": ((1,), "", "density of the heading's innovations at low frequency; 1 without a magnetometer"),
+    "field_averages": ((4,), "", "its averages and sums"),
     "clock": ((3,), "wide", "time of the last sample, of the start of the step, of the first sample, s"),
     "count": ((2,), "int", "whether the filter has started; samples in the step"),
 }
@@ -69,7 +69,6 @@ PASSING = {
     "end": ((1, 4), "", "and at its end"),
     "now": ((1,), "wide", "time of its end, s"),
     "turn_variance": ((1,), "", "0: the rotation over the step is as certain as ever"),
-    "nis": ((1,), "", "NIS of the heading"),
     "found_direction": ((1, 3), "", "heading measurement at the end of the step"),
     "found_sigma": ((1,), "", "its sigma; 0: none"),
     "found_usual": ((1, 2), "", "usual magnitude and dip of the field"),
@@ -95,12 +94,12 @@ class Routines(NamedTuple):
     follow: Any
     average: Any
     end: Any
-    compare: Any
+    judge: Any
     scale: Any
     carry: Any
     average_field: Any
     head: Any
-    field_mean: Any
+    judge_field: Any
     watch: Any
 
 
@@ -108,12 +107,12 @@ KERNELS = Routines(
     follow=follow_gyro,
     average=average_samples,
     end=end_steps,
-    compare=gravity_deviation,
+    judge=innovation_density,
     scale=scale_factors,
     carry=carry_to_stamps,
     average_field=average_samples,
     head=heading_steps,
-    field_mean=running_mean,
+    judge_field=innovation_density,
     watch=find_rests,
 )
 
@@ -257,18 +256,18 @@ def end_step(imu):
     a.edge[0], a.edge[1] = 0, a.count[1]
     call(routines.average.address, routines.average.arguments, ())
     call(routines.end.address, routines.end.arguments, ())
-    call(routines.compare.address, routines.compare.arguments, ())
     predict_filter(imu, a.turn)
     number = a.number[0]
     if number > 0.0:
-        update_filter(imu, 0, a.mean, imu.noise / math.sqrt(number * imu.interval))
+        update_filter(imu, 0, a.mean, imu.noise / math.sqrt(number * imu.interval), a.force_innovation)
+        call(routines.judge.address, routines.judge.arguments, ())
     if imu.magnetometer > 0:
         end_field(imu)
     begin_step(imu)
 
 
 def end_field(imu):
-    """Process the field of a step; update with a heading that ends with it, and update the level of the field's disturbance."""
+    """Process the field of a step; update with a heading that ends with it."""
     a, routines = imu.arrays, imu.routines
     call(routines.average_field.address, routines.average_field.arguments, ())
     middle = (a.edge[1] + 1) // 2
@@ -279,8 +278,8 @@ def end_field(imu):
     a.turn_variance[0] = 0.0
     call(routines.head.address, routines.head.arguments, ())
     if a.found_sigma[0] > 0.0:
-        a.nis[0] = update_filter(imu, 1, a.found_direction, a.found_sigma[0])
-        call(routines.field_mean.address, routines.field_mean.arguments, ())
+        update_filter(imu, 1, a.found_direction, a.found_sigma[0], a.field_innovation)
+        call(routines.judge_field.address, routines.judge_field.arguments, ())
     a.iron_variance[0] = a.found_variance[0]
 
 
@@ -328,8 +327,8 @@ def predict_filter(imu, turn):
         imu.refused[0] = code
 
 
-def update_filter(imu, sensor, vector, sigma):
-    """Update the filter with a vector of a sensor; return the NIS of a heading, 0 if it was not used."""
+def update_filter(imu, sensor, vector, sigma, normalized):
+    """Update the filter with a vector of a sensor; write the innovations over their σ (1, m), 0 if they were not used."""
     live = imu.filter
     length = live.declared[sensor, LENGTH]
     for i in range(ROW):
@@ -340,8 +339,9 @@ def update_filter(imu, sensor, vector, sigma):
     code = process(live, imu.arrays.clock[0], 1, 0)
     if code < 0:
         imu.refused[0] = code
-    nis = live.innovation[0, 0] * live.innovation[0, 0] / live.innovation[0, 1]
-    return nis if abs(nis) < math.inf else 0.0
+    for i in range(normalized.shape[1]):
+        value = live.innovation[0, 2 * i] / math.sqrt(live.innovation[0, 2 * i + 1])
+        normalized[0, i] = value if abs(value) < math.inf else 0.0
 
 
 def show_filter(imu):

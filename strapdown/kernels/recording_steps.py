@@ -148,8 +148,6 @@ class Steps(NamedTuple):
     """(k, 6, 6)"""
     tilt: np.ndarray
     """Factor (k,) on the σ of the tilt."""
-    floor: np.ndarray
-    """Variance (k,) of the tilt in addition, rad²."""
     heading: np.ndarray
     """Factor (k,) on the σ of the rotation about the vertical."""
     iron: np.ndarray
@@ -192,17 +190,18 @@ class Limits(NamedTuple):
     """Variance of the timing error, along the rate, s²."""
     tilt: float
     heading: float
-    """Variances, rad², up to which a factor below 1 applies."""
+    """Variances, rad², up to which the factors apply."""
+    accelerometer: float
+    """Variance of the tilt by the accelerometer's own error, rad², in addition."""
 
 
 def limited(factor, variance, limit):
-    """Return the factor on σ if one below 1 applies to the variance up to a limit only, and not to what exceeds it.
+    """Return the factor on σ if one is to apply to the variance up to a limit only, and not to what exceeds it.
 
-    Such a factor stands for motion and fields that are usually smaller than modelled. They cause at most the variance of a filter that has
+    Such a factor stands for motion and fields that differ from those modelled. They affect at most the variance of a filter that has
     settled; a larger one, as at a start in motion or after a gap, is of a rotation that is unknown.
     """
-    less = min(factor, 1.0)
-    return max(factor, 1.0) * math.sqrt(1.0 - (1.0 - less * less) * min(limit / variance, 1.0))
+    return math.sqrt(1.0 + (factor * factor - 1.0) * min(limit / variance, 1.0))
 
 
 def level_factors(factor, xx, xy, yy, limit):
@@ -228,7 +227,7 @@ def carry_to_stamps(steps, stamps, limits, out):
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
         sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt)
         h = limited(steps.heading[k], zz, limits.heading)
-        floor, iron = steps.floor[k], steps.iron[k]
+        floor, iron = limits.accelerometer, steps.iron[k]
         x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
         level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
         beside = (h * (sx * xz + sm * yz), h * (sm * xz + sy * yz))
@@ -262,76 +261,50 @@ def carry_to_stamps(steps, stamps, limits, out):
                         out.covariance[n, 3 + i, 3 + j] = P[3 + i, 3 + j]
 
 
-class Shares(NamedTuple):
-    """Constants of the reported covariance: :mod:`strapdown.ahrs.regions`."""
+class Scales(NamedTuple):
+    """Factors on the variances of the filter, for innovations that are white: :mod:`strapdown.ahrs.regions`."""
 
     tilt: float
-    tilt_variance: float
-    """(m/s²)²"""
-    tilt_by_field: float
-    max_tilt_by_field: float
-    """m/s²"""
     heading: float
-    heading_by_field: float
     max_heading: float
-    field_level: float
-    gravity: float
+    """Maximum factor on the variance of the heading."""
 
 
-def scale_factors(field_level, deviation, shares, tilt, floor, heading):
-    """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each.
-
-    ``deviation`` (k,): mean square deviation of the specific force from gravity (:func:`gravity_deviation`), (m/s²)².
-    """
-    for i in range(len(field_level)):
-        field = field_level[i] / shares.field_level
-        by_field = min(shares.tilt_by_field * field, shares.max_tilt_by_field)
-        variance = shares.tilt_variance + deviation[i] + by_field * by_field
-        tilt[i] = math.sqrt(shares.tilt)
-        floor[i] = variance / (shares.gravity * shares.gravity)
-        scaled = shares.heading_by_field * (field * math.sqrt(math.sqrt(field)))
-        heading[i] = math.sqrt(min(shares.heading + scaled, shares.max_heading))
+def scale_factors(force_density, field_density, scales, tilt, heading):
+    """Write the factors on σ of the tilt and of the heading (k,), from the densities (:func:`innovation_density`) of both sensors (k,)."""
+    for i in range(len(tilt)):
+        force, field = force_density[i], field_density[i]
+        tilt[i] = math.sqrt(scales.tilt * (force * math.sqrt(math.sqrt(force))))
+        heading[i] = math.sqrt(min(scales.heading * (field * math.sqrt(math.sqrt(field))), scales.max_heading))
 
 
-class SlowMotion(NamedTuple):
-    """Constants of the deviation of the specific force from gravity in slow motion."""
+class Averages(NamedTuple):
+    """Constants of the density of innovations."""
 
-    gravity: float
     share: float
-    """Weight of a step in the mean force of the last second."""
-    quiet_variance: float
-    """Variance of the force within that second, (m/s²)², at which its deviation counts a quarter."""
-    max_square: float
-    """Maximum square deviation, (m/s²)²."""
-    steps: float
-    """Steps in slow motion at which half of the mean square deviation is reported."""
+    """Weight of an innovation in their average."""
+    forgotten: float
+    """Weight of a density in the mean density."""
 
 
-def gravity_deviation(total, number, constants, memory, deviation):
-    """Write the mean square deviation (k,) of the specific force from gravity in the motion up to each step, (m/s²)².
+def innovation_density(normalized, constants, memory, density):
+    """Write the spectral density (k,) of innovations at low frequency up to each, relative to that of white ones.
 
-    ``total`` (k, 3): sum of each step's samples, in axes that do not rotate, and their ``number`` (k,). The mean force of a second in which
-    the force hardly changes is that of a unit that moves slowly: its magnitude differs from gravity by the accelerometer's error along
-    the vertical. ``memory`` (7,): sum, with exponential forgetting, of the forces, of their squares, and of the weights; sum of the
-    weighted square deviations and of their weights.
+    It is the mean square of their moving average over that of white innovations. ``normalized`` (k, m): innovations over their σ.
+    ``memory`` (m + 3,): their moving averages; the variance of one if they are white; sum of the densities, with exponential forgetting,
+    and of their weights.
     """
-    for i in range(len(total)):
-        if number[i] > 0.0:
-            x, y, z = total[i, 0] / number[i], total[i, 1] / number[i], total[i, 2] / number[i]
-            kept = 1.0 - constants.share
-            memory[0] = kept * memory[0] + x
-            memory[1] = kept * memory[1] + y
-            memory[2] = kept * memory[2] + z
-            memory[3] = kept * memory[3] + (x * x + y * y + z * z)
-            memory[4] = kept * memory[4] + 1.0
-            x, y, z = memory[0] / memory[4], memory[1] / memory[4], memory[2] / memory[4]
-            square = x * x + y * y + z * z
-            change = max(memory[3] / memory[4] - square, 0.0) / constants.quiet_variance
-            error = math.sqrt(square) - constants.gravity
-            weight = 1.0 / ((1.0 + change) * (1.0 + change))
-            memory[5] += weight * min(error * error, constants.max_square)
-            memory[6] += weight
-        deviation[i] = memory[5] / (constants.steps + memory[6])
+    m = len(memory) - 3
+    kept, remembered = 1.0 - constants.share, 1.0 - constants.forgotten
+    for i in range(len(density)):
+        square = 0.0
+        for j in range(m):
+            memory[j] = kept * memory[j] + constants.share * normalized[i, j]
+            square += memory[j] * memory[j]
+        memory[m] = kept * kept * memory[m] + constants.share * constants.share
+        memory[m + 1] = remembered * memory[m + 1] + square / (m * memory[m])
+        memory[m + 2] = remembered * memory[m + 2] + 1.0
+        density[i] = memory[m + 1] / memory[m + 2]
 
 
 def low_pass(values, share, result):
@@ -341,14 +314,3 @@ def low_pass(values, share, result):
         for i in range(len(values)):
             y += share * (values[i, j] - y)
             result[i, j] = y
-
-
-def running_mean(values, share, sums, mean):
-    """Write the mean (k,) of ``values`` up to each, with exponential forgetting by ``share`` a value.
-
-    ``sums``: sum of the values and of their weights before, and at return, after them (2,).
-    """
-    for i in range(len(values)):
-        sums[0] = (1.0 - share) * sums[0] + values[i]
-        sums[1] = (1.0 - share) * sums[1] + 1.0
-        mean[i] = sums[0] / sums[1]
