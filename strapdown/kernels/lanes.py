@@ -335,8 +335,8 @@ def _lanes_of(target: Any, builder: Any, sig: Any, pattern: Any) -> Any:
 def _align_stack(builder: Any) -> None:
     """Align the stack to cache lines: spilled vectors that cross two lines cost more than the arithmetic.
 
-    A stack frame has the strictest alignment of its variables, so an aligned one is made, once in a function; an empty inline assembly keeps
-    it.
+    A stack frame has the strictest alignment of its variables, so an aligned one is made, once in a function; an empty inline assembly
+    keeps it.
     """
     if hasattr(builder.function, "stack_is_aligned"):
         return
