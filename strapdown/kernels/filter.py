@@ -46,7 +46,7 @@ from strapdown.kernels.gate_rules import (
 )
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED, arc_over_chord, robust_weight, seen_from
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import any_lane, lanes_of, load_like, select, store
+from strapdown.kernels.lane_values import any_lane, lanes_of, load_like, select, store, with_lane
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -244,6 +244,14 @@ def put_part(P, i, c, value):
         store(P, W * i + c, value)
     else:
         put_at(P, place(i, c), value)
+
+
+def with_entries(t, c, entries):
+    """Return the value of a row of one run from column c on with other entries, given by column and number."""
+    for j, number in entries:
+        if c <= j < c + 8:
+            t = with_lane(t, j - c, number)
+    return t
 
 
 def kept(parts, work, line):
@@ -1187,7 +1195,7 @@ def add_step(x, step, work, like):
 def rotate_covariance(P, work, gain, G, A, like):
     """Subtract Σ g gᵀ from P, and transform the attitude by G and the carried vectors by A."""
     groups = ((AXES, G), *((v, A) for v in STRUCTURE.vectors))
-    half = {}
+    half, whole = {}, {}
     for m, (v, T) in enumerate(groups):
         for first in PARTS if LANES == 1 else STATES:
             if first in PLAIN or LANES == 1 or any(first in w for w, _ in groups[m:]):
@@ -1198,19 +1206,28 @@ def rotate_covariance(P, work, gain, G, A, like):
                         put_part(P, v[a], first, half[v[a], first])
     for block in BLOCKS:
         for i in PLAIN:
-            for first in block:
-                if first >= i or LANES == 1:
-                    put_part(P, i, first, reduced(P, work, gain, i, first, like))
-    for i in ROTATED if LANES == 1 else ():
-        for j in PLAIN:
-            put_element(P, i, j, element_at(P, i, j, like))
+            columns = tuple(c for c in block if c >= i or LANES == 1)
+            row = tuple(reduced(P, work, gain, i, c, like) for c in columns)  # read as a whole before it is written
+            # Of one run, with the columns that rotate: a store of a number takes as long as that of a part.
+            rotated = tuple((j, element_at(P, j, i, like)) for j in ROTATED) if LANES == 1 else ()
+            for c, t in zip(columns, row, strict=True):
+                put_part(P, i, c, with_entries(t, c, rotated))
     for m, (v, _) in enumerate(groups):
         for w, T in groups[m:]:
             old = tuple(tuple(element_at(P, i, j, like) if LANES == 1 else half[i, j] for j in w) for i in v)
             for a in AXES:
                 for d in AXES:
                     if w[d] >= v[a] or w != v:
-                        put_element(P, v[a], w[d], products(old[a], T[3 * d : 3 * d + 3]))
+                        whole[v[a], w[d]] = whole[w[d], v[a]] = products(old[a], T[3 * d : 3 * d + 3])
+    for i in ROTATED:
+        if LANES == 1:
+            entries = tuple((j, whole[i, j]) for j in ROTATED)
+            for c in sorted({j - j % 8 for j in ROTATED}):
+                put_part(P, i, c, with_entries(half[i, c], c, entries))
+        else:
+            for j in ROTATED:
+                if j >= i:
+                    put_element(P, i, j, whole[i, j])
 
 
 # ---------------------------------------------------------------------------------------- very precise measurements, by Joseph's form

@@ -351,6 +351,11 @@ def _spread_over_lanes(target: Any, builder: Any, sig: Any, x: Any) -> Any:
     return _spread(builder, x, _vector(sig.return_type))
 
 
+@_instead_of(lane_values.with_lane, lambda x, place, value: x(x, types.intp, x.dtype))
+def _with_lane(target: Any, builder: Any, sig: Any, x: Any, place: Any, value: Any) -> Any:
+    return builder.insert_element(x, value, place)
+
+
 @_instead_of(lane_values.narrowed, lambda x, like: _like(getattr(like, "dtype", like), x)(x, like))
 def _narrowed(target: Any, builder: Any, sig: Any, x: Any, like: Any) -> Any:
     return _converted(builder, x, sig.args[0], sig.return_type)
