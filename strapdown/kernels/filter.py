@@ -1040,14 +1040,14 @@ def gains(s, x, P, work, measured, numbers, factor, like):
     rows = tuple(tuple(h[i] for i in used) for h in H if any_number(h))  # the length of a vector has no information
     p = [tuple(products(row, tuple(part(P, i, c, like) for i in used)) for c in PARTS) for row in rows]
     p = [kept(t, work, LINE * (FACTORS + i)) for i, t in enumerate(p)]
-    seen = [tuple(entry(t, work, LINE * (FACTORS + i), k) for k in used) for i, t in enumerate(p)]
+    entries = [tuple(entry(t, work, LINE * (FACTORS + i), k) for k in used) for i, t in enumerate(p)]
     errors, step, gain, inverted, variances, shares = list(y), (0,) * len(PARTS), [], [], [], {}
     precise = None
     # H P Hᵀ + R = L D Lᵀ from the products of all rows, none of which waits for the rows before it.
     for i, row in enumerate(rows):
-        variance, column = products(row, seen[i]), []
+        variance, column = products(row, entries[i]), []
         for j in AXES[:i]:
-            m = products(row, seen[j])
+            m = products(row, entries[j])
             for k in AXES[:j]:
                 m = m - shares[j, k] * column[k]
             column.append(m)
