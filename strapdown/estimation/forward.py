@@ -7,6 +7,7 @@ The filter is that of :mod:`strapdown.kernels.filter`, compiled for its number o
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
@@ -556,7 +557,7 @@ def kernel_model(model: Model, variances: tuple[float, float]) -> structure.Mode
 def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     """Return the filter as the kernels' arguments."""
     model, initial, kernels = problem.model, problem.initial, instance_of(problem.model)
-    x, P = np.zeros((2, kernels.N + 1)), np.zeros((2, kernels.N, kernels.W))
+    x, P = np.zeros((2, kernels.N + 1)), aligned_zeros(2, kernels.N, kernels.W)
     if initial.gate is not None and initial.gate.candidate is not None:
         candidate = initial.gate.candidate
         x[1] = np.concatenate([candidate.attitude, candidate.others])
@@ -567,7 +568,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         P=P.reshape(2, -1),
         coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
         dt=np.zeros(1),
-        work=np.zeros(kernels.LINES * kernels.LINE),
+        work=aligned_zeros(kernels.LINES * kernels.LINE),
         shape=model.shape,
         length=lengths(problem.record, problem.events, model, units),
         turning=turns(problem),
@@ -575,6 +576,13 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     )
     put_state(body, initial)
     return body
+
+
+def aligned_zeros(*shape: int) -> Array:
+    """Return an array of zeros that begins with a cache line, so that no eight numbers from a multiple of eight on lie in two lines."""
+    numbers = np.zeros(math.prod(shape) + WIDTH - 1)
+    first = -(numbers.ctypes.data // numbers.itemsize) % WIDTH
+    return numbers[first : first + math.prod(shape)].reshape(shape)
 
 
 ANY_SENSOR = modelling.assemble((), {kind: kind for kind in KIND_CODES}, isotropic=False)
