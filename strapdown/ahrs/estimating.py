@@ -22,8 +22,8 @@ from strapdown.ahrs.starting import (
     need_accelerometer,
     rests,
     samples_in_span,
+    take_rate_at_rest,
     with_all_rests,
-    with_rate_at_rest,
 )
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
@@ -207,20 +207,16 @@ def _run(
     added = uncertain_turns(over_steps(turn_variance, prepared.edge))
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
 
-    def changed(state: estimation.State, edge: int) -> estimation.State:
+    def change(edge: int, x: Array, P: Array) -> None:
         for k in np.flatnonzero(rested == edge):
-            state = with_rate_at_rest(state, at_rest.rate[k], float(at_rest.sigma[k]))
-        if added[edge].any():
-            P = np.array(state.covariance)
-            P[:3, :3] += np.diag(added[edge])
-            state = replace(state, covariance=P)
-        return state
+            take_rate_at_rest(x, P, at_rest.rate[k], float(at_rest.sigma[k]))
+        P[[0, 1, 2], [0, 1, 2]] += added[edge]
 
     bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()
-    state = changed(prepared.initial, 0)
+    state = prepared.initial.changed(functools.partial(change, 0))
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
-        spans = [estimation.Span(last, functools.partial(changed, edge=last)) for last in bounds[1:]]
+        spans = [estimation.Span(last, functools.partial(change, last)) for last in bounds[1:]]
         online = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
         return replace(online, events=tuple(event for event in online.events if event.kind != "gap")), None
@@ -238,7 +234,7 @@ def _run(
         forward.append(filtered if not forward else filtered[1:])
         if last < bounds[-1]:
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
-            state = changed(state, last)
+            state = state.changed(functools.partial(change, last))
     whole = joined(parts)
     return whole, regions.disagreement(whole.attitude, np.concatenate(forward))
 

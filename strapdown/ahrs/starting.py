@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -225,29 +226,24 @@ def informative(at_rest: Rests, time: Array, parameters: AhrsParameters) -> Rest
     return Rests(at_rest.last[kept], at_rest.rate[kept], at_rest.sigma[kept])
 
 
-def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> estimation.State:
-    """Return the state corrected by a measurement of the gyro's bias (3,) with σ, rad/s.
+def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float) -> None:
+    """Correct attitude, bias and error states x (n + 1,) and their covariance by a measurement of the gyro's bias (3,) with σ, rad/s.
 
     The velocity, which is defined in the axes of the estimated attitude, is not rotated with it: at rest it is as small as the correction,
     so the difference is of second order (at most 0.01° over 88 public recordings).
     """
-    P = np.asarray(state.covariance)
     K = np.linalg.solve(P[3:6, 3:6] + sigma**2 * np.eye(3), P[3:6]).T
-    change = K @ (rate - state.bias)
+    change = K @ (rate - x[4:7])
     left = np.eye(len(P))
     left[:, 3:6] -= K
-    P = left @ P @ left.T + sigma**2 * K @ K.T
-    attitude, reset = moved(state.attitude.tolist(), change[:3].tolist())
-    J = np.eye(len(P))
-    J[:3, :3] = np.reshape(reset, (3, 3))
-    P = J @ P @ J.T
-    return replace(
-        state,
-        attitude=np.array(unit(attitude)),
-        bias=state.bias + change[3:6],
-        values=state.values + change[6:],
-        covariance=0.5 * (P + P.T),
-    )
+    after = left @ P @ left.T + sigma**2 * K @ K.T
+    attitude, reset = moved(x[:4].tolist(), change[:3].tolist())
+    J = np.reshape(reset, (3, 3))
+    after[:3] = J @ after[:3]
+    after[:, :3] = after[:, :3] @ J.T
+    x[:4] = unit(attitude)
+    x[4:] += change[3:]
+    P[:] = 0.5 * (after + after.T)
 
 
 def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) -> AhrsParameters:
@@ -283,4 +279,5 @@ def with_all_rests(
         information = information / (1.0 + information * walk * (after - time[last]))
         total = information + sigma**-2
         mean, information, after = (information * mean + sigma**-2 * rate) / total, total, time[last]
-    return with_rate_at_rest(state, mean, float(np.sqrt(1.0 / information + walk * (after - time[0]))))
+    sigma = float(np.sqrt(1.0 / information + walk * (after - time[0])))
+    return state.changed(functools.partial(take_rate_at_rest, rate=mean, sigma=sigma))
