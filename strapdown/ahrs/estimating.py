@@ -13,7 +13,7 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, regions
 from strapdown.ahrs.parameters import AhrsParameters, of_motion
-from strapdown.ahrs.preparing import Prepared, over_steps, prepare
+from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
     first_vector,
@@ -156,9 +156,9 @@ def estimate(
     else:
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
-    filtered, disagreement = _run(prepared, parameters, faults.turn_variance, at_rest, options)
+    filtered, disagreement = _run(prepared, parameters, at_rest, options)
     scales = regions.scales(filtered, prepared.deviation, parameters, disagreement=disagreement)
-    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
+    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
@@ -193,7 +193,7 @@ class _Options(NamedTuple):
 
 
 def _run(
-    prepared: Prepared, parameters: AhrsParameters, turn_variance: Array, at_rest: Rests, options: _Options
+    prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options: _Options
 ) -> tuple[Estimate, float | None]:
     """Return the filter's or the smoother's estimate at the steps, and the smoother's disagreement with its filter.
 
@@ -204,7 +204,7 @@ def _run(
     record, own, smooth = prepared.record, parameters.setup, options.smooth
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    added = uncertain_turns(over_steps(turn_variance, prepared.edge))
+    added = uncertain_turns(prepared.turn_variance)
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
 
     def change(edge: int, x: Array, P: Array) -> None:
@@ -259,7 +259,6 @@ def _at_stamps(
     prepared: Prepared,
     parameters: AhrsParameters,
     delays: Delays,
-    turn_variance: Array,
     options: _Options,
 ) -> Estimate:
     """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
@@ -269,8 +268,7 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
-    uncertain = np.asarray(over_steps(turn_variance, edge).any(axis=1))
-    level = regions.acceleration_level(filtered, uncertain, interval)
+    level = regions.acceleration_level(filtered, prepared.turn_variance.any(axis=1), interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:

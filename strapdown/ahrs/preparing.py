@@ -36,6 +36,8 @@ class Prepared(NamedTuple):
     """Attitude from the gyro only at every sample, identity at the first one (n, 4)."""
     deviation: Array
     """Mean square deviation of the specific force from gravity up to each edge of the steps (k + 1,), (m/s²)²."""
+    turn_variance: Array
+    """Variance of the rotation about each body axis over each step in addition to the gyro's noise, rad² (k, 3)."""
     field: headings.Headings | None
     """What was found of the field; None without a magnetometer."""
 
@@ -44,7 +46,7 @@ def prepare(
     recording: Recording,
     parameters: AhrsParameters,
     field_delay: Array | float = 0.0,
-    turn_variance: Array | float = 0.0,
+    turn_variance: Array | None = None,
     *,
     causal: bool = True,
     turned: Array | None = None,
@@ -53,8 +55,8 @@ def prepare(
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
     by the gyro. ``causal``: a heading's noise depends only on the samples up to it, and on ``turn_variance``, the variance of the rotation
-    about each body axis over each sample interval in addition to the gyro's noise, rad², one number or (n − 1, 3). ``turned`` (n, 4):
-    attitude from the gyro only, if already computed.
+    about each body axis over each sample interval in addition to the gyro's noise, rad² (n − 1, 3). ``turned`` (n, 4): attitude from the
+    gyro only, if already computed.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
@@ -67,6 +69,7 @@ def prepare(
     force, turn = np.empty((2, len(edge) - 1, 3))
     compiled(recording_steps.end_steps)(read_only(turned), edge, total, number, force, turn)
     shown = number > 0
+    added = np.zeros_like(turn) if turn_variance is None else over_steps(turn_variance, edge)
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
@@ -87,7 +90,7 @@ def prepare(
         field, sampled = sums(recording.magnetic_field, frame, edge)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
-            variance = over_steps(np.broadcast_to(turn_variance, (len(turned) - 1, 3)), edge).max(axis=1)
+            variance = added.max(axis=1)
             variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
             rows = kernel.Steps(
                 field, sampled, sampled * interval, middle, total, number, turned[edge[1:]], time[1:], variance
@@ -108,7 +111,7 @@ def prepare(
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
     deviation = regions.gravity_deviation(total, number, step)
-    return Prepared(record, initial, edge, turned, deviation, heading)
+    return Prepared(record, initial, edge, turned, deviation, added, heading)
 
 
 def without_temperature(
@@ -136,8 +139,11 @@ def edges(time: Array, step: float, interval: float) -> np.ndarray:
 
 
 def over_steps(variance: Array, edge: np.ndarray) -> Array:
-    """Return the sum over each step (k, 3) of a variance of each sample interval (n − 1, 3)."""
-    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp), axis=0))
+    """Return the sum over each step (k, 3) of a variance of each sample interval (n − 1, 3), which is mostly zero."""
+    total = np.zeros((len(edge) - 1, 3))
+    rows = np.unique(np.flatnonzero(variance) // 3)
+    np.add.at(total, np.searchsorted(edge, rows, side="right") - 1, variance[rows])
+    return total
 
 
 def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
