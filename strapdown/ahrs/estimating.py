@@ -12,7 +12,7 @@ import numpy as np
 
 from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, regions
-from strapdown.ahrs.parameters import AhrsParameters, of_motion
+from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
@@ -73,8 +73,8 @@ class AhrsEstimate:
         Spans at rest whose mean rates were used as measurements of the gyro's bias.
     hard_iron : ndarray (3,)
         Hard iron of the magnetometer at the end, body axes, in the unit of its samples.
-    calibration : UnitCalibration or None
-        Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it.
+    applied : UnitCalibration or None
+        Calibration of the unit by which the samples were corrected.
     """
 
     recording: Recording
@@ -86,7 +86,15 @@ class AhrsEstimate:
     faults: Faults
     rests: Rests
     hard_iron: Array
-    calibration: UnitCalibration | None
+    applied: UnitCalibration | None
+
+    @property
+    def calibration(self) -> UnitCalibration | None:
+        """Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it."""
+        scale = self.estimate.error_states.get("gyro scale")
+        if scale is None:
+            return None
+        return with_gyro_states(self.applied, scale, self.delays.last_field, self.recording.source)
 
 
 def estimate(
@@ -159,11 +167,10 @@ def estimate(
     filtered, disagreement = _run(prepared, parameters, at_rest, options)
     scales = regions.scales(filtered, prepared.deviation, parameters, disagreement=disagreement)
     at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, options)
-    scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
         estimate=at_stamps,
-        calibration=None if scale is None else with_gyro_states(calibration, scale, delays.last_field, used.source),
+        applied=calibration,
         record=prepared.record,
         initial=prepared.initial,
         parameters=parameters,
@@ -202,8 +209,7 @@ def _run(
     The filter's bias is corrected after each span at rest; the smoother's initial state includes all of them.
     """
     record, own, smooth = prepared.record, parameters.setup, options.smooth
-    kinds = {series.sensor: series.kind for series in record.vectors}
-    blocks = () if own.states is None else own.states.blocks(kinds)
+    blocks = error_states(parameters, *((series.sensor, series.kind) for series in record.vectors))
     added = uncertain_turns(prepared.turn_variance)
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
 
@@ -268,7 +274,7 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
-    level = regions.acceleration_level(filtered, prepared.turn_variance.any(axis=1), interval)
+    level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:
