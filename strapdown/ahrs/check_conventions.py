@@ -542,7 +542,7 @@ def _with_reference(recording: Recording, sensors: _Sensors, step: int) -> _Expl
 
     def at(rows: np.ndarray) -> Array:
         """Return the reference (readings, m, 4)."""
-        q = quaternion.normalize(true[rows])
+        q = true[rows] / lengths(true[rows])[:, None]
         return np.stack([q, *(read(q) for read in ATTITUDE_READINGS.values())])
 
     reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))

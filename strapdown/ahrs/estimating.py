@@ -36,7 +36,6 @@ from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
-from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
 
 FAR_START = 20.0 * DEGREE
@@ -290,7 +289,6 @@ def _at_stamps(
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))
-    sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
         time=used.time,
         attitude=attitude,
@@ -298,11 +296,7 @@ def _at_stamps(
         variance=variance,
         covariance=P if options.full_covariance else None,
         innovations=regions.scaled_innovations(filtered, level),
-        skipped={
-            name: len(samples) - int(np.count_nonzero(sampled(samples)))
-            for name, samples in sensors.items()
-            if samples is not None
-        },
+        skipped=prepared.skipped,
         events=filtered.events,
         error_states=_OfRows(filtered.error_states, row),
     )

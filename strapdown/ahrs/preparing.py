@@ -17,6 +17,7 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
+from strapdown.records.recording import sampled
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import VectorMeasurements
 
@@ -38,6 +39,8 @@ class Prepared(NamedTuple):
     """Mean square deviation of the specific force from gravity up to each edge of the steps (k + 1,), (m/s²)²."""
     turn_variance: Array
     """Variance of the rotation about each body axis over each step in addition to the gyro's noise, rad² (k, 3)."""
+    skipped: dict[str, int]
+    """Number of the gyro's samples without one of each other sensor."""
     field: headings.Headings | None
     """What was found of the field; None without a magnetometer."""
 
@@ -80,6 +83,7 @@ def prepare(
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
+    skipped = {"accelerometer": missing(recording.specific_force, number)}
     heading = None
     if recording.magnetic_field is not None:
         frame = turned
@@ -87,20 +91,21 @@ def prepare(
             frame = np.empty_like(turned)
             over = sensor_delays.turn_over(recording, field_delay)
             compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        field, sampled = sums(recording.magnetic_field, frame, edge)
+        field, counted = sums(recording.magnetic_field, frame, edge)
+        skipped["magnetometer"] = missing(recording.magnetic_field, counted)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
             variance = added.max(axis=1)
             variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
             rows = kernel.Steps(
-                field, sampled, sampled * interval, middle, total, number, turned[edge[1:]], time[1:], variance
+                field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance
             )
             heading = headings.online(rows, float(time[0]), parameters, step)
         else:
             samples = headings.FieldSteps(
-                field=field / np.maximum(sampled, 1.0)[:, None],
+                field=field / np.maximum(counted, 1.0)[:, None],
                 frame=middle,
-                length=sampled * interval,
+                length=counted * interval,
                 force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
                 at_edge=turned[edge],
                 time=time,
@@ -111,7 +116,7 @@ def prepare(
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
     deviation = regions.gravity_deviation(total, number, step)
-    return Prepared(record, initial, edge, turned, deviation, added, heading)
+    return Prepared(record, initial, edge, turned, deviation, added, skipped, heading)
 
 
 def without_temperature(
@@ -151,3 +156,8 @@ def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total, number
+
+
+def missing(samples: Array, number: Array) -> int:
+    """Return the number of rows (n, 3) that are no samples, given the number of samples of each step; the first row is in no step."""
+    return len(samples) - int(number.sum() + np.count_nonzero(sampled(samples[:1])))

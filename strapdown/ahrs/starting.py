@@ -254,13 +254,14 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
     """
     assert recording.specific_force is not None
     if parameters.usual_variation > 0.0:
-        variation = float(np.nanstd(lengths(recording.specific_force)))
+        size = lengths(recording.specific_force)
+        variation = float(np.std(size[np.isfinite(size)]))
         factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
         parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
     if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
         parts, part = rest_length(recording.interval)
-        rows = at_rest.last[:, None] + np.arange(1 - parts * part, 1)
-        force = lengths(np.nanmean(recording.specific_force[rows], axis=1))
+        spans = [recording.specific_force[last + 1 - parts * part : last + 1] for last in at_rest.last]
+        force = lengths(np.array([np.nanmean(span, axis=0) for span in spans]))
         deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
         if deviation > MAX_DEVIATION:
             parameters = replace(parameters, accelerometer_bias_sigma=deviation)
