@@ -626,10 +626,9 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
     number = np.add.outer([len(common) for common in commons], [0] * columns + [1] * len(alike))
     settings, misfit = {}, {}
     for (name, values), choice in zip(parts.items(), combinations, strict=True):
-        changed = _number_of_changes(name)
+        changed = np.array([len(changes) for changes in _settings(name)])
         best = np.argsort(PENALTY * changed - _score(values, floors[name]), axis=1, kind="stable")[:, :3]
-        declared = np.zeros((len(best), 1), int)  # comes first, and once
-        best = np.hstack([declared, np.where(best, best, -1)])[:, choice]
+        best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, choice]  # as declared comes first, and once
         number[:, :columns] += changed[best]
         whole = np.array(alike, int) * (len(changed) // len(AXES))
         settings[name] = np.hstack([best, np.tile(whole, (len(commons), 1))])
@@ -653,12 +652,6 @@ def _settings(name: str) -> tuple[tuple[str, ...], ...]:
     return tuple(
         (_axes_change(name, k),) * (k > 0) + (unit,) * (unit != "") for k in range(len(AXES)) for unit in units
     )
-
-
-@functools.cache
-def _number_of_changes(name: str) -> np.ndarray:
-    """Return the number of changes of each setting."""
-    return np.array([len(changes) for changes in _settings(name)])
 
 
 @functools.cache
