@@ -596,9 +596,9 @@ def row_at(A, i):
     return tuple(part(A, i, c, 0.0) for c in PARTS)
 
 
-def minus_row(row, B, k, factor):
-    """Return a row less a factor times row k of the matrix B."""
-    return tuple(t - factor * part(B, k, c, factor) for t, c in zip(row, PARTS, strict=True))
+def minus_row(row, factor, other):
+    """Return a row less a factor times another."""
+    return tuple(t - factor * u for t, u in zip(row, other, strict=True))
 
 
 def put_row(A, i, factor, row):
@@ -620,15 +620,18 @@ def noisy_row_at(A, i):
     return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_PARTS)
 
 
-def minus_noisy_row(row, A, k, factor):
-    """Return a row less a factor times row k of such a matrix."""
-    return tuple(t - factor * u for t, u in zip(row, noisy_row_at(A, k), strict=True))
-
-
-def put_noisy_row(A, i, factor, row):
-    """Write a factor times a row to row i of such a matrix."""
+def scale_noisy_row(A, i, factor):
+    """Multiply row i of such a matrix by a factor, and return it."""
+    row = tuple(factor * t for t in noisy_row_at(A, i))
     for c, t in zip(NOISY_PARTS, row, strict=True):
-        store(A, NOISY_WIDTH * i + c, factor * t)
+        store(A, NOISY_WIDTH * i + c, t)
+    return row
+
+
+def subtract_noisy_row(A, i, factor, row):
+    """Subtract a factor times a row from row i of such a matrix."""
+    for c, t, u in zip(NOISY_PARTS, noisy_row_at(A, i), row, strict=True):
+        store(A, NOISY_WIDTH * i + c, t - factor * u)
 
 
 def gather_noisy_columns(A, B):
