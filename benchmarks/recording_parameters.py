@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import recordings as leaderboard
 from strapdown import ahrs
-from strapdown.ahrs import AhrsParameters
+from strapdown.ahrs import AhrsParameters, starting
 from strapdown.checks import Array
 from strapdown.files import write_json
 from strapdown.recordings import Recording, sensor_faults
@@ -62,6 +62,7 @@ PARTS: dict[str, Callable[[AhrsParameters], AhrsParameters] | tuple[Any, dict[st
     "bounded velocity (white acceleration instead)": lambda p: replace(p, velocity_sigma=0.0, specific_force_noise=0.6),
     "gyro scale and misalignment": lambda p: replace(p, gyro_scale_sigma=0.0),
     "level of the motion": lambda p: replace(p, usual_variation=0.0),
+    "accelerometer bias that rest shows": (starting, {"MAX_DEVIATION": np.inf}),
     "accelerometer bias": lambda p: replace(p, accelerometer_bias_sigma=0.0),
     "drift of the gyro's bias": lambda p: replace(p, rate_random_walk=0.0),
     "hard iron": lambda p: replace(p, hard_iron_sigma=0.0),

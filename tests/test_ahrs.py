@@ -545,6 +545,26 @@ def test_all_rests_are_combined_as_they_drift():
 # ---------------------------------------------------------------------------------------------------- what moves it
 
 
+def test_the_smoother_finds_the_bias_of_an_accelerometer_that_rest_shows(monkeypatch):
+    """0.27 m/s², of which the first two seconds, at rest, show the vertical part."""
+    clean = recording(noise=1.0)
+    biased = dataclasses.replace(clean, specific_force=clean.specific_force + np.array([0.15, -0.1, 0.2]))
+    inclination = worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
+    monkeypatch.setattr(starting, "MAX_DEVIATION", np.inf)
+    assert inclination < 0.5 * worst(ahrs.estimate(biased, smooth=True), after=5.0)["inclination"]
+
+
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.05), (0.0, 0.0, 0.15)])
+def test_the_bias_of_the_accelerometer_has_the_sigma_that_rest_shows(bias):
+    quiet = quiet_second((0.0, 0.0, 0.0))
+    up = quiet.specific_force.mean(axis=0) / np.linalg.norm(quiet.specific_force.mean(axis=0))
+    quiet = dataclasses.replace(quiet, specific_force=quiet.specific_force + bias[2] * up)
+    parameters = starting.for_whole(quiet, ahrs.HAND_HELD_SMOOTHED, rests_of(quiet))
+    deviation = abs(9.81 + bias[2] - 9.80665)
+    expected = deviation if deviation > 0.1 else ahrs.HAND_HELD_SMOOTHED.accelerometer_bias_sigma
+    assert parameters.accelerometer_bias_sigma == pytest.approx(expected, abs=2e-3)
+
+
 @pytest.mark.parametrize(("variation", "factor"), [(0.1, 0.4), (0.7, 0.5), (1.4, 1.0), (2.1, 1.5), (9.0, 2.0)])
 def test_the_smoothers_acceleration_follows_that_of_the_recording(variation, factor):
     """The magnitude alternates between two values, whose deviation is known."""
@@ -552,7 +572,7 @@ def test_the_smoothers_acceleration_follows_that_of_the_recording(variation, fac
     sign = np.where(np.arange(len(quiet.time)) % 2, 1.0, -1.0)[:, None]
     force = quiet.specific_force * (1.0 + variation / 9.81 * sign)
     smoothed = ahrs.HAND_HELD_SMOOTHED
-    parameters = starting.for_whole(dataclasses.replace(quiet, specific_force=force), smoothed)
+    parameters = starting.for_whole(dataclasses.replace(quiet, specific_force=force), smoothed, starting.NO_REST)
     assert parameters.velocity_sigma == pytest.approx(factor * smoothed.velocity_sigma, rel=1e-9)
     assert dataclasses.replace(parameters, velocity_sigma=smoothed.velocity_sigma) == smoothed
 

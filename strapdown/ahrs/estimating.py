@@ -155,7 +155,7 @@ def estimate(
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
     if smooth:
-        parameters = for_whole(used, parameters)
+        parameters = for_whole(used, parameters, at_rest)
     prepared = prepare(used, parameters, delays.field, faults.turn_variance, causal=not smooth, turned=turned)
     if smooth:
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))

@@ -72,7 +72,8 @@ class AhrsParameters:
         Standard deviation of the magnitude of the specific force, m/s², in the motion that these parameters model. The smoother, which has
         the whole recording, multiplies ``velocity_sigma`` by that of the recording relative to it; 0: it does not.
     accelerometer_bias_sigma : float, default 0.0
-        σ of a constant bias of the accelerometer, each component, m/s²; 0: no states.
+        σ of a constant bias of the accelerometer, each component, m/s²; 0: no states. The smoother replaces it by the difference between
+        the specific force at rest and gravity if that is larger than 0.1 m/s².
     tilt_sigma : float, default 0.04
         σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
     tilt_scale, heading_scale : float, default 5.0, 3.5

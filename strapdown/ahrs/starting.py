@@ -33,6 +33,8 @@ MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
 VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
+MAX_DEVIATION = 0.1
+"""Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
 MIN_LEVEL = 0.07
 """Squared cosine of the dip, 75°, beyond which a field has hardly a heading."""
 FIRST_HEADING = 0.1
@@ -244,18 +246,26 @@ def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float) -> None:
     P[:] = 0.5 * (after + after.T)
 
 
-def for_whole(recording: Recording, parameters: AhrsParameters) -> AhrsParameters:
-    """Return the smoother's parameters, which follow what a whole recording shows of the motion.
+def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) -> AhrsParameters:
+    """Return the smoother's parameters, which follow what a whole recording shows of the motion and of the accelerometer.
 
-    σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``).
+    σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``). If the specific
+    force at rest differs from gravity by more than :data:`MAX_DEVIATION`, σ of the accelerometer's bias is that difference.
     """
-    if parameters.usual_variation == 0.0:
-        return parameters
     assert recording.specific_force is not None
-    size = lengths(recording.specific_force)
-    variation = float(np.std(size[np.isfinite(size)]))
-    factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
-    return replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
+    if parameters.usual_variation > 0.0:
+        size = lengths(recording.specific_force)
+        variation = float(np.std(size[np.isfinite(size)]))
+        factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
+        parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
+    if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
+        parts, part = rest_length(recording.interval)
+        spans = [recording.specific_force[last + 1 - parts * part : last + 1] for last in at_rest.last]
+        force = lengths(np.array([np.nanmean(span, axis=0) for span in spans]))
+        deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
+        if deviation > MAX_DEVIATION:
+            parameters = replace(parameters, accelerometer_bias_sigma=deviation)
+    return parameters
 
 
 def with_all_rests(
