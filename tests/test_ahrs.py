@@ -931,6 +931,19 @@ def test_tilt_and_heading_are_scaled_up_to_their_limits(heading_scale, monkeypat
     np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_accelerometers_own_error_is_part_of_the_tilts_sigma(smooth):
+    """0.5 m/s² over gravity about both level axes, and nothing else."""
+    level = []
+    for sigma in (0.0, 0.5):
+        unit = dataclasses.replace(ahrs.HAND_HELD, tilt_sigma=sigma)
+        result = ahrs.estimate(recording(noise=1.0), unit, smooth=smooth, full_covariance=True).estimate
+        R = quaternion.to_matrix(result.attitude)
+        level.append(R @ result.covariance[:, :3, :3] @ R.transpose(0, 2, 1))
+    expected = np.diag([1.0, 1.0, 0.0]) * (0.5 / 9.80665) ** 2
+    np.testing.assert_allclose(level[1] - level[0], np.broadcast_to(expected, level[0].shape), atol=1e-12)
+
+
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     whole = hand_held.simulated(1, 0, 20.0)
     moving = hand_held.modified(whole)["no rest"]
