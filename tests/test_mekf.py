@@ -166,7 +166,7 @@ def test_many_series_are_one_series_of_as_many_references():
     np.testing.assert_array_equal(ran[0].variance, ran[1].variance)
 
 
-@pytest.mark.parametrize("dip", [0.1, 1.17])
+@pytest.mark.parametrize("dip", [1.17, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_heading(dip):
     """By tan(dip) times as much, of a coarse accelerometer beside a sharp magnetometer: eᵀP⁻¹e about each axis and all three."""
     reference = np.array([0.0, np.cos(dip), -np.sin(dip)])
