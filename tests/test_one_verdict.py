@@ -80,7 +80,7 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
     assert sd.read(sd.write(result, tmp_path / "again.h5")) == result
 
 
-def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
+def test_an_estimate_with_options_by_every_way(tmp_path):
     short = replace(sd.scenarios.load_scenario("two-stars"), duration=60.0)
     source = sd.write(sd.simulate(short, seed=5), tmp_path / "record.h5")
     for name, flags, estimator, options in (
