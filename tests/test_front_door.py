@@ -147,7 +147,7 @@ def test_monte_carlo_verdict():
 
 
 def test_one_state_by_name_is_that_of_the_command(succeeds, tmp_path):
-    errors = {"scale_factor": (3e-4, 0.0, 0.0), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
+    errors = {"scale_factor": (0.0, 0.0, 3e-4), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
     with_errors = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
     sd.write(sd.simulate(with_errors, seed=9), tmp_path / "record.h5")
     succeeds("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", "--state", "gyro.scale")
