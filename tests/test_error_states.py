@@ -410,8 +410,9 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
     record, blocks = record_of(anisotropic=option == "all"), OPTIONS[option]
     options = {"gate": gate, "full_covariance": True}
 
-    def wider(state):
-        return dataclasses.replace(state, bias=state.bias + 1e-4, covariance=2.0 * state.covariance)
+    def wider(x, P):
+        x[4:7] += 1e-4
+        P *= 2.0
 
     n = len(record.increments)
     spans = [forward.Span(24, wider), forward.Span(55), forward.Span(n, wider)]
@@ -419,7 +420,7 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
     state, first, parts = start(), 0, []
     for last, change in spans:
         part, end = estimation.run_part(records.cut(record, first, last), NOISE, state, blocks, **options)
-        state, first = change(end) if change else end, last
+        state, first = end.changed(change) if change else end, last
         parts.append(part)
     for name in ("attitude", "bias", "variance", "covariance"):
         joined = np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])

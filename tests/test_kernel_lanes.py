@@ -38,6 +38,7 @@ from strapdown.kernels.lane_values import (
     store,
     store_quadruples,
     sum_lanes,
+    with_lane,
 )
 
 RANDOM = np.random.default_rng(5)
@@ -204,6 +205,21 @@ def test_quadruples(start, stride):
         expected[row] = a[row]
     np.testing.assert_array_equal(fast, expected)
     np.testing.assert_array_equal(plain, expected)
+
+
+def replace_two_lanes(a, out):
+    x = load(a, 0)
+    store(out, 0, with_lane(with_lane(x, 2, a[8]), 7, a[9]))
+    store(out, 8, x)
+
+
+def test_number_in_one_lane():
+    a = RANDOM.standard_normal(10)
+    expected = np.concatenate([a[[0, 1, 8, 3, 4, 5, 6, 9]], a[:8]])
+    for function in (kernel(replace_two_lanes), replace_two_lanes):
+        out = np.empty(16)
+        function(a, out)
+        np.testing.assert_array_equal(out, expected)
 
 
 def test_every_lane_function_has_its_machine_form():

@@ -230,8 +230,9 @@ def examine(recording: Recording) -> Examination:
         raise InputError(
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
+    step = max(1, round(MIN_INTERVAL / recording.interval))
     sensors = {
-        name: _sensor(vectors)
+        name: _sensor(vectors, step)
         for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
         if vectors is not None
     }
@@ -240,7 +241,9 @@ def examine(recording: Recording) -> Examination:
     doubts += _too_fast(recording) + stuck
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
-    explanations = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
+    explanations = (_without_reference if recording.true_attitude is None else _with_reference)(
+        recording, sensors, step
+    )
     notes = _unseen(recording)
     if explanations is None:
         reason = "the recording has hardly any rotation, or too few samples"
@@ -396,7 +399,7 @@ def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
 
 
 def _too_fast(recording: Recording) -> list[str]:
-    if np.max(np.abs(recording.rate)) <= FASTEST / math.sqrt(3.0):
+    if max(recording.rate.max(), -recording.rate.min()) <= FASTEST / math.sqrt(3.0):
         return []
     speed = lengths(recording.rate)
     k = int(np.argmax(speed))
@@ -447,8 +450,11 @@ class _Sensor(NamedTuple):
     """Samples of a vector."""
 
     vectors: Array
+    """Those at the interval used."""
+    known: np.ndarray
+    """Which of them there are."""
     size: Array
-    """Magnitudes of its samples, of those that there are."""
+    """Magnitudes of all samples that there are."""
     strength: float
     """Their median."""
 
@@ -456,10 +462,12 @@ class _Sensor(NamedTuple):
 _Sensors = Mapping[str, _Sensor]
 
 
-def _sensor(vectors: Array) -> _Sensor:
+def _sensor(vectors: Array, step: int) -> _Sensor:
+    """Return the samples of a vector, with every ``step``-th to be used."""
     size = lengths(vectors)
-    size = size[np.isfinite(size)]
-    return _Sensor(vectors, size, median(size))
+    known = np.isfinite(size)
+    size = size if known.all() else size[known]
+    return _Sensor(vectors[::step], known[::step], size, median(size))
 
 
 class _Windows(NamedTuple):
@@ -489,21 +497,17 @@ def _turned(means: Array) -> Array:
     return np.moveaxis(means @ _ALL.reshape(-1, 9).T, -1, -3)
 
 
-def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool = True) -> _Windows | None:
-    """Return the windows with samples of each vector, where the attitude is ``known``; None if there are none."""
-    step = max(1, round(MIN_INTERVAL / recording.interval))
-    rows = slice(None, None, step)
-    time = recording.time[rows]
+def _windows(recording: Recording, sensors: _Sensors, step: int, known: np.ndarray | bool = True) -> _Windows | None:
+    """Return the windows with samples of each vector, every ``step``-th, where the attitude is ``known``; None if there are none."""
+    time = recording.time[::step]
     if len(time) < 2:
         return None
     window = np.floor((time - time[0]) / SPAN).astype(int)
-    turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
+    turning = np.bincount(window, lengths(recording.rate[::step])) / np.bincount(window).clip(1)
     least = 0.5 * max(1.0, SPAN / median(np.diff(time)))
-    known = np.broadcast_to(known, recording.time.shape)[rows]
     side_by_side, used = np.zeros((len(time), WIDTH)), {}
-    for name, (vectors, _, strength) in sensors.items():
-        samples = vectors[rows]
-        has_sample = np.isfinite(lengths(samples)) & known & (strength > 0.0)
+    for name, (samples, there, _, strength) in sensors.items():
+        has_sample = there & known & (strength > 0.0)
         full = np.flatnonzero(np.bincount(window[has_sample], minlength=len(turning)) >= least)
         fastest = np.zeros(len(turning), bool)
         fastest[full[np.argsort(-turning[full])][:WINDOWS]] = True
@@ -529,18 +533,16 @@ MAX_TURNS = 500
 not recognised, because the errors of their references weigh more in windows with smaller rotations."""
 
 
-def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | None:
+def _with_reference(recording: Recording, sensors: _Sensors, step: int) -> _Explanations | None:
     true = recording.true_attitude
     assert true is not None
-    size = lengths(true)
-    known = np.isfinite(size) & (size > 0.0)
-    first, last, turn = _turns(recording, known)
+    first, last, turn = _turns(recording, true)
     if len(first) < 10:
         return None
 
     def at(rows: np.ndarray) -> Array:
         """Return the reference (readings, m, 4)."""
-        q = quaternion.normalize(true[rows])
+        q = true[rows] / lengths(true[rows])[:, None]
         return np.stack([q, *(read(q) for read in ATTITUDE_READINGS.values())])
 
     reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))
@@ -548,7 +550,7 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
         return None
     parts = {"gyro": np.repeat(_gyro_fits(turn, reference), len(FRAMES), axis=0)}
     to_enu = np.stack([frame.T for frame in FRAMES.values()])
-    windows = _windows(recording, sensors, known)
+    windows = _windows(recording, sensors, step, _known(true[::step]))
     for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
         v = _turned(means)  # (readings, 48, windows, 3)
         square = np.mean(np.sum(v**2, axis=-1), axis=-1)[:, None]
@@ -557,14 +559,20 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
     return _combined(parts, _floors(parts, FLOORS["reference"], sensors))
 
 
-def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
+def _known(true: Array) -> np.ndarray:
+    """Return a mask (m,) of the references (m, 4) that are attitudes."""
+    size = lengths(true)
+    return np.isfinite(size) & (size > 0.0)
+
+
+def _turns(recording: Recording, true: Array) -> tuple[np.ndarray, np.ndarray, Array]:
     """Return first and last samples of the short windows with the largest rotations, and the rotations (k, 3) measured there by the gyro.
 
-    ``known`` masks the samples at which a window may begin and end.
+    A window begins and ends at samples with a reference ``true`` (n, 4).
     """
     step = max(1, round(REFERENCE_SPAN / recording.interval))
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
-    first = first[known[first] & known[first + step]]
+    first = first[_known(true[first]) & _known(true[first + step])]
     turn = _turns_between(recording, first, first + step)
     largest = np.sort(np.argsort(-lengths(turn))[:MAX_TURNS])
     return first[largest], first[largest] + step, turn[largest]
@@ -659,13 +667,13 @@ def _axes_change(name: str, k: int) -> str:
 # --------------------------------------------------------------------------------------------------------------- without a reference
 
 
-def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations | None:
+def _without_reference(recording: Recording, sensors: _Sensors, step: int) -> _Explanations | None:
     """Return explanations with one wrong sensor: two wrong sensors could not be distinguished from the third one being wrong.
 
     For a proper rotation P of the gyro's axes, increments P Δθ integrate to P R Pᵀ. P therefore has the same effect on a vector's mean as
     axes Pᵀ of the vector's sensor. An improper P is a proper one of the inverted gyro, which is integrated separately.
     """
-    windows = _windows(recording, sensors)
+    windows = _windows(recording, sensors, step)
     if windows is None:
         return None
     # Only within each window: the attitude at its begin has no effect on the misfits.

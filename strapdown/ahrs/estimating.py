@@ -12,8 +12,8 @@ import numpy as np
 
 from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, regions
-from strapdown.ahrs.parameters import AhrsParameters, of_motion
-from strapdown.ahrs.preparing import Prepared, over_steps, prepare
+from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
+from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
     first_vector,
@@ -22,8 +22,8 @@ from strapdown.ahrs.starting import (
     need_accelerometer,
     rests,
     samples_in_span,
+    take_rate_at_rest,
     with_all_rests,
-    with_rate_at_rest,
 )
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
@@ -35,7 +35,6 @@ from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
-from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
 
 FAR_START = 20.0 * DEGREE
@@ -72,8 +71,8 @@ class AhrsEstimate:
         Spans at rest whose mean rates were used as measurements of the gyro's bias.
     hard_iron : ndarray (3,)
         Hard iron of the magnetometer at the end, body axes, in the unit of its samples.
-    calibration : UnitCalibration or None
-        Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it.
+    applied : UnitCalibration or None
+        Calibration of the unit by which the samples were corrected.
     """
 
     recording: Recording
@@ -85,7 +84,15 @@ class AhrsEstimate:
     faults: Faults
     rests: Rests
     hard_iron: Array
-    calibration: UnitCalibration | None
+    applied: UnitCalibration | None
+
+    @property
+    def calibration(self) -> UnitCalibration | None:
+        """Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it."""
+        scale = self.estimate.error_states.get("gyro scale")
+        if scale is None:
+            return None
+        return with_gyro_states(self.applied, scale, self.delays.last_field, self.recording.source)
 
 
 def estimate(
@@ -155,14 +162,13 @@ def estimate(
     else:
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
-    filtered = _run(prepared, parameters, faults.turn_variance, at_rest, options)
+    filtered = _run(prepared, parameters, at_rest, options)
     scales = regions.scales(filtered, parameters, max(parameters.step, used.interval), causal=not smooth)
-    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
-    scale = filtered.error_states.get("gyro scale")
+    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, options)
     return AhrsEstimate(
         recording=used,
         estimate=at_stamps,
-        calibration=None if scale is None else with_gyro_states(calibration, scale, delays.last_field, used.source),
+        applied=calibration,
         record=prepared.record,
         initial=prepared.initial,
         parameters=parameters,
@@ -191,9 +197,7 @@ class _Options(NamedTuple):
     full_covariance: bool
 
 
-def _run(
-    prepared: Prepared, parameters: AhrsParameters, turn_variance: Array, at_rest: Rests, options: _Options
-) -> Estimate:
+def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options: _Options) -> Estimate:
     """Return the filter's or the smoother's estimate at the steps.
 
     The record is run in parts. Before each uncertain rotation (:func:`uncertain_turns`) its variance is added to that of the attitude; the
@@ -201,25 +205,20 @@ def _run(
     The filter's bias is corrected after each span at rest; the smoother's initial state includes all of them.
     """
     record, own, smooth = prepared.record, parameters.setup, options.smooth
-    kinds = {series.sensor: series.kind for series in record.vectors}
-    blocks = () if own.states is None else own.states.blocks(kinds)
-    added = uncertain_turns(over_steps(turn_variance, prepared.edge))
+    blocks = error_states(parameters, *((series.sensor, series.kind) for series in record.vectors))
+    added = uncertain_turns(prepared.turn_variance)
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
 
-    def changed(state: estimation.State, edge: int) -> estimation.State:
+    def change(edge: int, x: Array, P: Array) -> None:
         for k in np.flatnonzero(rested == edge):
-            state = with_rate_at_rest(state, at_rest.rate[k], float(at_rest.sigma[k]))
-        if added[edge].any():
-            P = np.array(state.covariance)
-            P[:3, :3] += np.diag(added[edge])
-            state = replace(state, covariance=P)
-        return state
+            take_rate_at_rest(x, P, at_rest.rate[k], float(at_rest.sigma[k]))
+        P[[0, 1, 2], [0, 1, 2]] += added[edge]
 
     bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()
-    state = changed(prepared.initial, 0)
+    state = prepared.initial.changed(functools.partial(change, 0))
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
-        spans = [estimation.Span(last, functools.partial(changed, edge=last)) for last in bounds[1:]]
+        spans = [estimation.Span(last, functools.partial(change, last)) for last in bounds[1:]]
         online = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
         return replace(online, events=tuple(event for event in online.events if event.kind != "gap"))
@@ -236,7 +235,7 @@ def _run(
         parts.append(smoothed)
         if last < bounds[-1]:
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
-            state = changed(state, last)
+            state = state.changed(functools.partial(change, last))
     return joined(parts)
 
 
@@ -260,7 +259,6 @@ def _at_stamps(
     prepared: Prepared,
     parameters: AhrsParameters,
     delays: Delays,
-    turn_variance: Array,
     options: _Options,
 ) -> Estimate:
     """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
@@ -270,8 +268,7 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
-    uncertain = np.asarray(over_steps(turn_variance, edge).any(axis=1))
-    level = regions.acceleration_level(filtered, uncertain, interval)
+    level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:
@@ -287,7 +284,6 @@ def _at_stamps(
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))
-    sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
         time=used.time,
         attitude=attitude,
@@ -295,11 +291,7 @@ def _at_stamps(
         variance=variance,
         covariance=P if options.full_covariance else None,
         innovations=regions.scaled_innovations(filtered, level),
-        skipped={
-            name: len(samples) - int(np.count_nonzero(sampled(samples)))
-            for name, samples in sensors.items()
-            if samples is not None
-        },
+        skipped=prepared.skipped,
         events=filtered.events,
         error_states=_OfRows(filtered.error_states, row),
     )

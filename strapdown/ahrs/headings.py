@@ -13,7 +13,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
-from strapdown.checks import Array, lengths
+from strapdown.checks import Array, lengths, median
 from strapdown.kernels import headings as kernel
 from strapdown.kernels.first_state import iron_variance, sine_of_dip
 from strapdown.kernels.machine import compiled, read_only
@@ -155,13 +155,13 @@ class _Look(NamedTuple):
 
 def _look(field: Array, vertical: Array, parameters: AhrsParameters, interval: float) -> _Look:
     level = _strength_and_dip(field, vertical)
-    usual = np.broadcast_to(np.median(level, axis=0), level.shape)
+    usual = np.broadcast_to([median(column) for column in level.T], level.shape)
     share = interval / parameters.field_change_time
     change = field - 0.5 * (low_pass(field, share) + low_pass(field[::-1], share)[::-1])
     square = (
         (level[:, 0] / usual[:, 0] - 1.0) ** 2
         + (level[:, 1] - usual[:, 1]) ** 2
-        + np.sum(change**2, axis=1) / usual[:, 0] ** 2
+        + np.einsum("ki,ki->k", change, change) / usual[:, 0] ** 2
     )
     return _Look(level[:, 0], usual, low_pass(square[:, None], interval / parameters.field_memory)[:, 0])
 

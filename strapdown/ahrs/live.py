@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NoReturn
 
@@ -15,7 +16,7 @@ from strapdown.ahrs.preparing import GRAVITY
 from strapdown.checks import Array, InputError, instance, non_negative, positive
 from strapdown.estimation import live as estimation_live
 from strapdown.estimation.forward import TooPreciseError
-from strapdown.estimation.live import restart
+from strapdown.estimation.live import change, restart
 from strapdown.kernels import live_imu as kernel
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.live import TOO_PRECISE
@@ -262,7 +263,7 @@ class LiveAhrs:
             self._refuse(code)
         if code == kernel.RESTED:
             rate, sigma = self._rests.rest_rate[0], math.sqrt(self._rests.rest_variance[0])
-            restart(self._filter, starting.with_rate_at_rest(self._filter.state(), rate, sigma), self._call[0])
+            change(self._filter, functools.partial(starting.take_rate_at_rest, rate=rate, sigma=sigma))
             self._imu.resting[1] = 0
 
     def _begin(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from strapdown import estimation
 from strapdown.checks import non_negative, one_of, positive
+from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.units import DEGREE
@@ -159,6 +160,13 @@ class AhrsParameters:
             bias_sigma=self.bias_sigma,
             states=states if states.names else None,
         )
+
+
+@functools.lru_cache(maxsize=16)
+def error_states(parameters: AhrsParameters, *sensors: tuple[str, str]) -> tuple[ErrorStates, ...]:
+    """Return the error states of the filter with these sensors, each with its kind."""
+    states = parameters.setup.states
+    return () if states is None else states.blocks(dict(sensors))
 
 
 HAND_HELD = AhrsParameters(

@@ -17,6 +17,7 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
+from strapdown.records.recording import sampled
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import VectorMeasurements
 
@@ -34,6 +35,10 @@ class Prepared(NamedTuple):
     """Sample at which each step ends, preceded by the first sample (k + 1,)."""
     turned: Array
     """Attitude from the gyro only at every sample, identity at the first one (n, 4)."""
+    turn_variance: Array
+    """Variance of the rotation about each body axis over each step in addition to the gyro's noise, rad² (k, 3)."""
+    skipped: dict[str, int]
+    """Number of the gyro's samples without one of each other sensor."""
     field: headings.Headings | None
     """What was found of the field; None without a magnetometer."""
 
@@ -42,7 +47,7 @@ def prepare(
     recording: Recording,
     parameters: AhrsParameters,
     field_delay: Array | float = 0.0,
-    turn_variance: Array | float = 0.0,
+    turn_variance: Array | None = None,
     *,
     causal: bool = True,
     turned: Array | None = None,
@@ -51,8 +56,8 @@ def prepare(
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
     by the gyro. ``causal``: a heading's noise depends only on the samples up to it, and on ``turn_variance``, the variance of the rotation
-    about each body axis over each sample interval in addition to the gyro's noise, rad², one number or (n − 1, 3). ``turned`` (n, 4):
-    attitude from the gyro only, if already computed.
+    about each body axis over each sample interval in addition to the gyro's noise, rad² (n − 1, 3). ``turned`` (n, 4): attitude from the
+    gyro only, if already computed.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
@@ -65,6 +70,7 @@ def prepare(
     force, turn = np.empty((2, len(edge) - 1, 3))
     compiled(recording_steps.end_steps)(read_only(turned), edge, total, number, force, turn)
     shown = number > 0
+    added = np.zeros_like(turn) if turn_variance is None else over_steps(turn_variance, edge)
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
@@ -75,6 +81,7 @@ def prepare(
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
+    skipped = {"accelerometer": missing(recording.specific_force, number)}
     heading = None
     if recording.magnetic_field is not None:
         frame = turned
@@ -82,20 +89,21 @@ def prepare(
             frame = np.empty_like(turned)
             over = sensor_delays.turn_over(recording, field_delay)
             compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        field, sampled = sums(recording.magnetic_field, frame, edge)
+        field, counted = sums(recording.magnetic_field, frame, edge)
+        skipped["magnetometer"] = missing(recording.magnetic_field, counted)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
-            variance = over_steps(np.broadcast_to(turn_variance, (len(turned) - 1, 3)), edge).max(axis=1)
+            variance = added.max(axis=1)
             variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
             rows = kernel.Steps(
-                field, sampled, sampled * interval, middle, total, number, turned[edge[1:]], time[1:], variance
+                field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance
             )
             heading = headings.online(rows, float(time[0]), parameters, step)
         else:
             samples = headings.FieldSteps(
-                field=field / np.maximum(sampled, 1.0)[:, None],
+                field=field / np.maximum(counted, 1.0)[:, None],
                 frame=middle,
-                length=sampled * interval,
+                length=counted * interval,
                 force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
                 at_edge=turned[edge],
                 time=time,
@@ -105,7 +113,7 @@ def prepare(
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, heading)
+    return Prepared(record, initial, edge, turned, added, skipped, heading)
 
 
 def without_temperature(
@@ -133,8 +141,11 @@ def edges(time: Array, step: float, interval: float) -> np.ndarray:
 
 
 def over_steps(variance: Array, edge: np.ndarray) -> Array:
-    """Return the sum over each step (k, 3) of a variance of each sample interval (n − 1, 3)."""
-    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp), axis=0))
+    """Return the sum over each step (k, 3) of a variance of each sample interval (n − 1, 3), which is mostly zero."""
+    total = np.zeros((len(edge) - 1, 3))
+    rows = np.unique(np.flatnonzero(variance) // 3)
+    np.add.at(total, np.searchsorted(edge, rows, side="right") - 1, variance[rows])
+    return total
 
 
 def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
@@ -142,3 +153,8 @@ def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total, number
+
+
+def missing(samples: Array, number: Array) -> int:
+    """Return the number of rows (n, 3) that are no samples, given the number of samples of each step; the first row is in no step."""
+    return len(samples) - int(number.sum() + np.count_nonzero(sampled(samples[:1])))

@@ -45,9 +45,8 @@ def acceleration_level(filtered: Estimate, uncertain: np.ndarray, interval: floa
     """
     innovations = filtered.innovations["accelerometer"]
     nis = np.ones((len(filtered.time), 1))
-    nis[np.searchsorted(filtered.time, innovations.time), 0] = np.where(
-        np.isfinite(innovations.nis), innovations.nis / 3.0, 1.0
-    )
+    measured = innovations.nis / 3.0
+    nis[np.searchsorted(filtered.time, innovations.time), 0] = np.where(np.isfinite(measured), measured, 1.0)
     begin = np.append(0, np.flatnonzero(uncertain) + 1)
     nis[begin] = 1.0
     return np.concatenate([low_pass(part, interval / LEVEL_TIME) for part in np.split(nis, begin[1:])])[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -114,7 +115,7 @@ def first_vector(samples: Array | None, turned: Array, source: str, sensor: str)
             f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
         )
     k = int(np.argmax(valid))
-    return np.asarray(quaternion.rotate(turned[k], samples[k]))
+    return samples[0] if k == 0 else np.asarray(quaternion.rotate(turned[k], samples[k]))
 
 
 def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> estimation.State:
@@ -225,29 +226,24 @@ def informative(at_rest: Rests, time: Array, parameters: AhrsParameters) -> Rest
     return Rests(at_rest.last[kept], at_rest.rate[kept], at_rest.sigma[kept])
 
 
-def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> estimation.State:
-    """Return the state corrected by a measurement of the gyro's bias (3,) with σ, rad/s.
+def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float) -> None:
+    """Correct attitude, bias and error states x (n + 1,) and their covariance by a measurement of the gyro's bias (3,) with σ, rad/s.
 
     The velocity, which is defined in the axes of the estimated attitude, is not rotated with it: at rest it is as small as the correction,
     so the difference is of second order (at most 0.01° over 88 public recordings).
     """
-    P = np.asarray(state.covariance)
     K = np.linalg.solve(P[3:6, 3:6] + sigma**2 * np.eye(3), P[3:6]).T
-    change = K @ (rate - state.bias)
+    change = K @ (rate - x[4:7])
     left = np.eye(len(P))
     left[:, 3:6] -= K
-    P = left @ P @ left.T + sigma**2 * K @ K.T
-    attitude, reset = moved(state.attitude.tolist(), change[:3].tolist())
-    J = np.eye(len(P))
-    J[:3, :3] = np.reshape(reset, (3, 3))
-    P = J @ P @ J.T
-    return replace(
-        state,
-        attitude=np.array(unit(attitude)),
-        bias=state.bias + change[3:6],
-        values=state.values + change[6:],
-        covariance=0.5 * (P + P.T),
-    )
+    after = left @ P @ left.T + sigma**2 * K @ K.T
+    attitude, reset = moved(x[:4].tolist(), change[:3].tolist())
+    J = np.reshape(reset, (3, 3))
+    after[:3] = J @ after[:3]
+    after[:, :3] = after[:, :3] @ J.T
+    x[:4] = unit(attitude)
+    x[4:] += change[3:]
+    P[:] = 0.5 * (after + after.T)
 
 
 def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) -> AhrsParameters:
@@ -258,13 +254,14 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
     """
     assert recording.specific_force is not None
     if parameters.usual_variation > 0.0:
-        variation = float(np.nanstd(lengths(recording.specific_force)))
+        size = lengths(recording.specific_force)
+        variation = float(np.std(size[np.isfinite(size)]))
         factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
         parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
     if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
         parts, part = rest_length(recording.interval)
-        rows = at_rest.last[:, None] + np.arange(1 - parts * part, 1)
-        force = lengths(np.nanmean(recording.specific_force[rows], axis=1))
+        spans = [recording.specific_force[last + 1 - parts * part : last + 1] for last in at_rest.last]
+        force = lengths(np.array([np.nanmean(span, axis=0) for span in spans]))
         deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
         if deviation > MAX_DEVIATION:
             parameters = replace(parameters, accelerometer_bias_sigma=deviation)
@@ -283,4 +280,5 @@ def with_all_rests(
         information = information / (1.0 + information * walk * (after - time[last]))
         total = information + sigma**-2
         mean, information, after = (information * mean + sigma**-2 * rate) / total, total, time[last]
-    return with_rate_at_rest(state, mean, float(np.sqrt(1.0 / information + walk * (after - time[0]))))
+    sigma = float(np.sqrt(1.0 / information + walk * (after - time[0])))
+    return state.changed(functools.partial(take_rate_at_rest, rate=mean, sigma=sigma))

@@ -181,9 +181,10 @@ def estimate(
     for file, content in contents.items():
         write_json(out / file, {"source": recording.name, **content})
         paths.append(out / file)
-    if run.calibration is not None:
+    new = None if run.recorded is None else run.recorded.calibration
+    if new is not None:
         paths.append(out / "calibration.toml")
-        sd.calibration.write(run.calibration, paths[-1])
+        sd.calibration.write(new, paths[-1])
     paths += [sd.write(result, to, recording=None if simulated else source, **how) for to, how in exports.items()]
     if form is not None:
         paths += sd.plots.draw_estimate(result, out, form, title=recording.name)

@@ -257,7 +257,7 @@ def correct(f: Any, sensor: Sensor, measured: Measured, g: Any) -> None:
         for j in range(n):
             for i, gain in enumerate(g.gain):
                 work[k.LINE * (k.GAINS + i) + j] = gain[j]
-            work[k.LINE * k.STEP + j] = k.products(g.steps, tuple(gain[j] for gain in g.gain))
+            work[k.LINE * k.STEP + j] = g.step[j]
         for i in range(len(g.gain)):
             subtract(f, k.LINE * (k.GAINS + i), work)
 

@@ -7,7 +7,7 @@ those properties in which it differs from "no effect".
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from itertools import accumulate
 from typing import Any, Literal
 
@@ -86,6 +86,14 @@ class ErrorStates(ByValue):
     """Unit of each state."""
     sigma: Array
     """Initial standard deviation of each state (size,), greater than zero; all states are initially zero."""
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields of a dataclass; any other declaration equals itself only."""
+        return self is other or (is_dataclass(self) and super().__eq__(other))
+
+    def __hash__(self) -> int:
+        """Return a hash that equal declarations share."""
+        return hash((type(self), self.name))
 
     def _set(self, **values: Any) -> None:
         """Set attributes of a frozen declaration."""

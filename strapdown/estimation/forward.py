@@ -6,7 +6,7 @@ The filter is that of :mod:`strapdown.kernels.filter`, compiled for its number o
 
 from __future__ import annotations
 
-import functools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
@@ -24,6 +24,7 @@ from strapdown.estimation.model import Model
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule, skipped_too
 from strapdown.estimation.states import (
     Candidate,
+    Change,
     GateMemory,
     ProcessNoise,
     State,
@@ -76,8 +77,8 @@ class Span(NamedTuple):
 
     last: int
     """Last edge."""
-    change: Callable[[State], State] | None = None
-    """Returns the state from which the next span starts; None: the state at the end of this one."""
+    change: Change | None = None
+    """Changes the state before the next span."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -297,7 +298,7 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
             state, before = passed.end, mean
         if span.change is not None:
             at_edge = temperature.shifted(state, slopes, float(T[span.last]) - before)
-            state, before = span.change(at_edge), float(T[span.last])
+            state, before = at_edge.changed(span.change), float(T[span.last])
         begin = span.last
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
     estimate = joined(parts)
@@ -328,11 +329,11 @@ def _spans_of(problem: Problem) -> tuple[Span, ...]:
 
 
 def _in_spans(
-    problem: Problem, rows: Sequence[Array], read: Callable[[], State], write: Callable[[State], None]
+    problem: Problem, rows: Sequence[Array], body: six_states.Body | structure.Body
 ) -> Iterator[tuple[slice, tuple[Any, ...], list[Array]]]:
     """Yield the events, the kernel's first arguments and the rows to write for each span; then change the state.
 
-    ``rows``: arrays of the outputs with a row for each edge, ``read`` and ``write``: access to the state in the kernel's arrays.
+    ``rows``: arrays of the outputs with a row for each edge.
     """
     edges, increments = problem.gyro
     measured = problem.events.measurements
@@ -348,7 +349,7 @@ def _in_spans(
             for row, kept in zip(rows, at_first, strict=True):
                 row[first : first + 1] = kept
         if change is not None:
-            write(change(read()))
+            change_state(body, change)
         first, before = last, after
 
 
@@ -371,8 +372,7 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     out = six_states.Outputs._make((*written, segments[: options.segments]))
     body = body_in_registers(problem)
     state, number = body.state, 0
-    read, write = functools.partial(state_of_numbers, state), functools.partial(put_state, body)
-    for _, arguments, part in _in_spans(problem, out[:-2], read, write):
+    for _, arguments, part in _in_spans(problem, out[:-2], body):
         out_of_part = six_states.Outputs._make((*part, *out[-2:]))
         number = compiled(walk, six_states)(*arguments, every, body, out_of_part)
         if number < 0:
@@ -412,6 +412,15 @@ def put_state(body: six_states.Body | structure.Body, state: State) -> None:
     n = len(state.covariance)
     body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
     body.P[0].reshape(n, -1)[:, :n] = state.covariance
+
+
+def change_state(body: six_states.Body | structure.Body, change: Change) -> None:
+    """Change the state in the arrays of a kernel."""
+    if isinstance(body, six_states.Body):
+        put_state(body, state_of_numbers(body.state).changed(change))
+        return
+    n = body.x.shape[1] - 1
+    change(body.x[0], body.P[0].reshape(n, -1)[:, :n])
 
 
 def state_of_numbers(state: Array) -> State:
@@ -556,7 +565,7 @@ def kernel_model(model: Model, variances: tuple[float, float]) -> structure.Mode
 def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     """Return the filter as the kernels' arguments."""
     model, initial, kernels = problem.model, problem.initial, instance_of(problem.model)
-    x, P = np.zeros((2, kernels.N + 1)), np.zeros((2, kernels.N, kernels.W))
+    x, P = np.zeros((2, kernels.N + 1)), aligned_zeros(2, kernels.N, kernels.W)
     if initial.gate is not None and initial.gate.candidate is not None:
         candidate = initial.gate.candidate
         x[1] = np.concatenate([candidate.attitude, candidate.others])
@@ -567,7 +576,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         P=P.reshape(2, -1),
         coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
         dt=np.zeros(1),
-        work=np.zeros(kernels.LINES * kernels.LINE),
+        work=aligned_zeros(kernels.LINES * kernels.LINE),
         shape=model.shape,
         length=lengths(problem.record, problem.events, model, units),
         turning=turns(problem),
@@ -575,6 +584,13 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     )
     put_state(body, initial)
     return body
+
+
+def aligned_zeros(*shape: int) -> Array:
+    """Return an array of zeros that begins with a cache line, so that no eight numbers from a multiple of eight on lie in two lines."""
+    numbers = np.zeros(math.prod(shape) + WIDTH - 1)
+    first = -(numbers.ctypes.data // numbers.itemsize) % WIDTH
+    return numbers[first : first + math.prod(shape)].reshape(shape)
 
 
 ANY_SENSOR = modelling.assemble((), {kind: kind for kind in KIND_CODES}, isotropic=False)
@@ -627,8 +643,7 @@ def _run(problem: Problem, options: Options) -> Passed:
     if options.judged:
         judged = judge.outputs(out)
         weight = judged.weight
-    read, write = functools.partial(state_of, body, model, None, units), functools.partial(put_state, body)
-    for at, arguments, part in _in_spans(problem, out[:-2], read, write):
+    for at, arguments, part in _in_spans(problem, out[:-2], body):
         form = body._replace(length=body.length[at], turning=body.turning[at])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:

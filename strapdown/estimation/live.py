@@ -35,7 +35,7 @@ from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices
+from strapdown.estimation.states import Change, ProcessNoise, State, check_arguments, covariance_matrices
 from strapdown.kernels import gate, gate_rules, six_states, structure
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
@@ -518,6 +518,11 @@ def restart(live: LiveFilter, state: State, time: float) -> None:
     """Continue a filter without gate and look-back from another state, of six or of all states, at another time, s."""
     forward.put_state(live._body, modelling.begin(state, live._problem.error_states))
     live._time = live._arrays.clock[0] = time
+
+
+def change(live: LiveFilter, by: Change) -> None:
+    """Change the state of a filter without gate and look-back."""
+    forward.change_state(live._body, by)
 
 
 def arrays_of(live: LiveFilter) -> tuple[kernel.Live, Array, Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -31,28 +32,28 @@ def as_blocks(blocks: Sequence[ErrorStates]) -> tuple[ErrorStates, ...]:
 
 def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
     """Return a state with error states of zero added, with their declared covariance, independent of attitude and bias."""
-    blocks = as_blocks(blocks)
+    prior = _prior(as_blocks(blocks))
+    P = np.zeros((6 + len(prior), 6 + len(prior)))
+    P[:6, :6], P[6:, 6:] = initial.covariance, prior
+    return State(attitude=initial.attitude, bias=initial.bias, values=np.zeros(len(prior)), covariance=P)
+
+
+@functools.lru_cache(maxsize=16)
+def _prior(blocks: tuple[ErrorStates, ...]) -> Array:
+    """Return the covariance of error states with these declarations, which are checked."""
     check(blocks)
-    return _at_prior(initial, blocks)
-
-
-def _at_prior(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
-    """Return a state with error states of zero added, with the covariance of declarations that are checked."""
-    size = sum(block.size for block in blocks)
-    P = np.zeros((6 + size, 6 + size))
-    P[:6, :6] = initial.covariance
+    P = np.zeros((sum(block.size for block in blocks),) * 2)
     for block, own in spans(blocks):
-        P[6:, 6:][own, own] = block.covariance
-    return State(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
+        P[own, own] = block.covariance
+    return P
 
 
 def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
     """Return the initial state; if it has no error states, with those declared, at their prior."""
     check_arguments(initial=initial)
-    check(blocks)
-    size = sum(block.size for block in blocks)
+    size = len(_prior(blocks))
     if size and not len(initial.values):
-        return _at_prior(initial, blocks)
+        return with_error_states(initial, blocks)
     if len(initial.values) != size:
         raise InputError(
             f"initial has {len(initial.values)} error states, but {size} are declared; declare the same ones"
@@ -141,6 +142,15 @@ def assemble(
 
     Without error states, the structure has sensors of all kinds, so that its kernels are compiled only once.
     """
+    return _assembled(blocks, tuple(kinds.items()), isotropic, generic)
+
+
+@functools.lru_cache(maxsize=16)
+def _assembled(
+    blocks: tuple[ErrorStates, ...], sensors_and_kinds: tuple[tuple[str, str], ...], isotropic: bool, generic: bool
+) -> Model:
+    """Return the model that :func:`assemble` describes: short records need one model again and again."""
+    kinds = dict(sensors_and_kinds)
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):

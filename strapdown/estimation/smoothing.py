@@ -18,6 +18,7 @@ No information crosses a recovery, not even about the bias, for which the candid
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -138,7 +139,7 @@ def _digits_lost(problem: Problem, estimate: Estimate) -> int | None:
     A backward step subtracts the uncertainty of the bias of the start. What is left counts by the square of N, the share of the state in
     the prediction: its smoothed variance over the noise of the interval, and at most 1.
     """
-    least, added = estimate.variance[:, :3].min(axis=1), _added_angle(problem)
+    least, added = functools.reduce(np.minimum, estimate.variance[:, :3].T), _added_angle(problem)
     start = problem.record.intervals[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
     N = np.minimum(1.0, np.divide(least, added, out=np.ones(len(least)), where=added > 0.0))
     kept = (least > MIN_SMOOTHED * start * N**2) & (estimate.variance > 0.0).all(axis=1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -128,6 +128,16 @@ class State:
         object.__setattr__(self, "unit_sigma", units)
         size = 6 + len(values)
         object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
+
+    def changed(self, change: Change) -> State:
+        """Return the state after a change."""
+        x, P = np.concatenate([self.attitude, self.bias, self.values]), np.array(self.covariance)
+        change(x, P)
+        return replace(self, attitude=x[:4], bias=x[4:7], values=x[7:], covariance=P)
+
+
+Change = Callable[[Array, Array], None]
+"""A change in place of attitude, bias and error states (7 + m,) and of their covariance."""
 
 
 def initial_state(

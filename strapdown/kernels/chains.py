@@ -6,6 +6,8 @@ these do not enter the gyro. A single state is a chain of one.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, sum_lanes
@@ -35,7 +37,12 @@ def chain_step(decay, chains, k, first, dt):
 
     The first is column k of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the matrix exponential, also valid for equal or zero poles. The
     second is Q of the three (6-tuple), zero if absent: the same series at the nodes of Gauss's rule, accurate to 3e-14 for λ dt ≤ 1/2.
+    Both are in closed form for the first state of a chain.
     """
+    if k == first:
+        lost = -math.expm1(-decay[k] * dt)
+        noise = 0.5 * lost * (2.0 - lost) / decay[k] if decay[k] > 0.0 else dt
+        return (0.0, 0.0, 1.0 - lost), (0.0, 0.0, 0.0, 0.0, 0.0, noise)
     own = -decay[k] * dt
     middle, to_middle, far, to_far = 0.0, 0.0, 0.0, 0.0
     if k - 1 >= first:

@@ -46,7 +46,7 @@ from strapdown.kernels.gate_rules import (
 )
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED, arc_over_chord, robust_weight, seen_from
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import any_lane, lanes_of, load_like, select, store
+from strapdown.kernels.lane_values import any_lane, lanes_of, load_like, select, store, with_lane
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -96,7 +96,7 @@ MEAN = 12
 # Lines of the work space, each of LINE values.
 LINE = W + 8
 FACTORS, GAINS, ROWS = 0, 3, 6
-"""Products P h of the rows of a measurement, given those before; the same over the roots of their innovation variances; the rows h."""
+"""Products P h of the rows of a measurement; the same given the rows before, over the roots of their innovation variances; the rows h."""
 PRODUCT, STEP, ROUNDING, PRIOR, NOW_X, PRIOR_ROWS = 9, 10, 11, 12, 13, 14
 """P h of one row; a correction; the rounding error of P h; prior mean relative to a point of linearisation, the state there, and the rows
 there in the tangent space of the prior."""
@@ -120,9 +120,10 @@ CALLED = (
     "take_precisely",
     "take_row",
     "fill_coefficients",
-    *(f"{name}_{s}" for name in ("take", "write") for s in range(len(STRUCTURE.sensors))),
+    *(f"write_{s}" for s in range(len(STRUCTURE.sensors))),
 )
-"""Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
+"""Called, not inlined, by other kernels: each copy would be compiled again. An update is inlined: the sixty numbers of its arguments cost a
+tenth of its time, and no kernel has two copies."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ sums without zeros
@@ -243,6 +244,14 @@ def put_part(P, i, c, value):
         store(P, W * i + c, value)
     else:
         put_at(P, place(i, c), value)
+
+
+def with_entries(t, c, entries):
+    """Return the value of a row of one run from column c on with other entries, given by column and number."""
+    for j, number in entries:
+        if c <= j < c + 8:
+            t = with_lane(t, j - c, number)
+    return t
 
 
 def kept(parts, work, line):
@@ -587,9 +596,9 @@ def row_at(A, i):
     return tuple(part(A, i, c, 0.0) for c in PARTS)
 
 
-def minus_row(row, B, k, factor):
-    """Return a row less a factor times row k of the matrix B."""
-    return tuple(t - factor * part(B, k, c, factor) for t, c in zip(row, PARTS, strict=True))
+def minus_row(row, factor, other):
+    """Return a row less a factor times another."""
+    return tuple(t - factor * u for t, u in zip(row, other, strict=True))
 
 
 def put_row(A, i, factor, row):
@@ -611,15 +620,18 @@ def noisy_row_at(A, i):
     return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_PARTS)
 
 
-def minus_noisy_row(row, A, k, factor):
-    """Return a row less a factor times row k of such a matrix."""
-    return tuple(t - factor * u for t, u in zip(row, noisy_row_at(A, k), strict=True))
-
-
-def put_noisy_row(A, i, factor, row):
-    """Write a factor times a row to row i of such a matrix."""
+def scale_noisy_row(A, i, factor):
+    """Multiply row i of such a matrix by a factor, and return it."""
+    row = tuple(factor * t for t in noisy_row_at(A, i))
     for c, t in zip(NOISY_PARTS, row, strict=True):
-        store(A, NOISY_WIDTH * i + c, factor * t)
+        store(A, NOISY_WIDTH * i + c, t)
+    return row
+
+
+def subtract_noisy_row(A, i, factor, row):
+    """Subtract a factor times a row from row i of such a matrix."""
+    for c, t, u in zip(NOISY_PARTS, noisy_row_at(A, i), row, strict=True):
+        store(A, NOISY_WIDTH * i + c, t - factor * u)
 
 
 def gather_noisy_columns(A, B):
@@ -714,15 +726,14 @@ def turning_matrix(rate, acceleration):
     )
 
 
-def across(d, like):
-    """Return unit vectors t1, t2 with t1 × t2 = d, for a unit vector d."""
+def across(m, like):
+    """Return vectors t and m × t across a vector m ≠ 0: t is the product of m and the axis farthest from it."""
+    x, y, z = select(m[0] < 0.0, -m[0], m[0]), select(m[1] < 0.0, -m[1], m[1]), select(m[2] < 0.0, -m[2], m[2])
     ones = like + 1.0
-    x, y, z = select(d[0] < 0.0, -d[0], d[0]), select(d[1] < 0.0, -d[1], d[1]), select(d[2] < 0.0, -d[2], d[2])
     second = select(y < x, select(y <= z, ones, like), like)
     third = select(z < x, ones - second, like)
-    t = cross((ones - second - third, second, third), d)
-    t = scale(1.0 / square_root(dot(t, t)), t)
-    return t, cross(d, t)
+    t = cross((ones - second - third, second, third), m)
+    return t, cross(m, t)
 
 
 def effects_of(sensor, x, measured, numbers, like):
@@ -894,11 +905,11 @@ def vector_rows(s, x, measured, numbers, like, transverse):
     predicted = sum_of(predicted, effects.offset)
     squared = dot(predicted, predicted)
     if sensor.kind == DIRECTION:
-        shrink = 1.0 / square_root(squared)
-        axes = across(scale(shrink, predicted), like)
-        y = tuple(dot(t, z) for t in axes)
+        t, u = across(predicted, like)
+        shrink, over = 1.0 / square_root(squared), 1.0 / square_root(dot(t, t))  # neither root waits for the other
+        y = (over * dot(t, z), over * shrink * dot(u, z))
         along = shrink * dot(predicted, z)
-        axes = tuple(scale(shrink, t) for t in axes)
+        axes = (scale(over * shrink, t), scale(over * shrink * shrink, u))
     else:
         axes = (R[:3], R[3:6], R[6:])
         if transverse:
@@ -1029,35 +1040,42 @@ def gains(s, x, P, work, measured, numbers, factor, like):
     H, y, r, angle, valid = rows_of(s, x, measured, numbers, like)
     r = tuple(factor * t for t in r) if factor is not None else r
     used = tuple(i for i in STATES if any(not is_zero(h[i]) for h in H))
-    p = [tuple(products(tuple(h[i] for i in used), tuple(part(P, i, c, like) for i in used)) for c in PARTS) for h in H]
-    errors, gain, steps, inverted, variances, shares = list(y), [], [], [], [], []
+    rows = tuple(tuple(h[i] for i in used) for h in H if any_number(h))  # the length of a vector has no information
+    p = [tuple(products(row, tuple(part(P, i, c, like) for i in used)) for c in PARTS) for row in rows]
+    p = [kept(t, work, LINE * (FACTORS + i)) for i, t in enumerate(p)]
+    entries = [tuple(entry(t, work, LINE * (FACTORS + i), k) for k in used) for i, t in enumerate(p)]
+    errors, step, gain, inverted, variances, shares = list(y), (0,) * len(PARTS), [], [], [], {}
     precise = None
-    for i, h in enumerate(H):
-        if any_number(h):
-            row = tuple(h[k] for k in used)
-            for j in AXES[:i]:
-                share = products(row, tuple(entry(p[j], work, LINE * (FACTORS + j), k) for k in used)) * inverted[j]
-                p[i] = tuple(u - share * v for u, v in zip(p[i], p[j], strict=True))
-                errors[i] = errors[i] - share * errors[j]
-                shares.append(share)
-            p[i] = kept(p[i], work, LINE * (FACTORS + i))
-            variances.append(products(row, tuple(entry(p[i], work, LINE * (FACTORS + i), k) for k in used)) + r[i])
-            inverted.append(1.0 / variances[i])
-            root = square_root(inverted[i])
-            gain.append(kept(tuple(root * t for t in p[i]), work, LINE * (GAINS + i)))
-            steps.append(root * errors[i])
-            far = variances[i] > SHORT_FORM * r[i]
-            precise = far if precise is None else precise | far
-        else:  # the length of a vector has no information, but is part of the innovation
-            variances.append(r[i])
-            inverted.append(1.0 / r[i])
-            shares.extend([like, like])
+    # H P Hᵀ + R = L D Lᵀ from the products of all rows, none of which waits for the rows before it.
+    for i, row in enumerate(rows):
+        variance, column = products(row, entries[i]), []
+        for j in AXES[:i]:
+            m = products(row, entries[j])
+            for k in AXES[:j]:
+                m = m - shares[j, k] * column[k]
+            column.append(m)
+            share = shares[i, j] = m * inverted[j]
+            variance = variance - share * m
+            errors[i] = errors[i] - share * errors[j]
+            p[i] = tuple(u - share * v for u, v in zip(p[i], p[j], strict=True))
+        variances.append(variance + r[i])
+        inverted.append(1.0 / variances[i])
+        weight = inverted[i] * errors[i]
+        step = tuple(plus(t, weight * u) for t, u in zip(step, p[i], strict=True))
+        root = square_root(inverted[i])
+        gain.append(kept(tuple(root * t for t in p[i]), work, LINE * (GAINS + i)))
+        far = variances[i] > SHORT_FORM * r[i]
+        precise = far if precise is None else precise | far
+    for variance in r[len(rows) :]:  # that of the length is part of the innovation
+        variances.append(variance)
+        inverted.append(1.0 / variance)
+        shares[2, 0] = shares[2, 1] = like
     nis = products(tuple(e * e for e in errors), tuple(inverted))
     errors, variances = tuple(errors), tuple(variances)
     skipped = STRUCTURE.sensors[s].kind == HEADING  # possibly: a vertical vector has no heading
     reported = (select(valid, errors[0], like + math.nan),) if skipped else errors
-    rest = precise, tuple(shares), tuple(r), tuple(y), angle, valid, nis
-    return Gains(tuple(gain), tuple(steps), errors, variances, reported, *rest)
+    rest = precise, tuple(shares.values()), tuple(r), tuple(y), angle, valid, nis
+    return Gains(tuple(gain), step, errors, variances, reported, *rest)
 
 
 def innovation_covariance_of(shares, variances, noise, like):
@@ -1136,12 +1154,9 @@ def at_part(rows, c):
     return tuple(row[PARTS.index(c)] for row in rows if c in PARTS)
 
 
-def apply_gains(x, P, work, gain, steps, like):
+def apply_gains(x, P, work, gain, step, like):
     """Correct the state, update the covariance and transform it to the new tangent space, in one pass."""
-    step = tuple(
-        products(steps, tuple(entry(k, work, LINE * (GAINS + r), j) for r, k in enumerate(gain))) for j in STATES
-    )
-    correct_by(x, P, work, gain, step, like)
+    correct_by(x, P, work, gain, kept(step, work, LINE * STEP), like)
 
 
 def fixed_turn(before, after):
@@ -1156,22 +1171,34 @@ def correct_by(x, P, work, gain, step, like):
     changes it to A c, and its error likewise.
     """
     before = tuple_at(x, 0, 4, like)
-    both = turned_by(before, step[:3])
+    both = turned_by(before, tuple(entry(step, work, LINE * STEP, a) for a in AXES))
     q, G = both[:4], both[4:]
-    c = {k: value_at(x, 1 + k, like) + step[k] for k in OTHERS}
+    add_step(x, step, work, like)
     A = fixed_turn(before, q) if STRUCTURE.vectors else None
     for v in STRUCTURE.vectors:
-        for k, t in zip(v, matrix_times_vector(A, tuple(c[k] for k in v)), strict=True):
-            c[k] = t
-    for i, t in enumerate((*q, *(c[k] for k in OTHERS))):
+        for k, t in zip(v, matrix_times_vector(A, tuple(value_at(x, 1 + k, like) for k in v)), strict=True):
+            put_at(x, 1 + k, t)
+    for i, t in enumerate(q):
         put_at(x, i, t)
     rotate_covariance(P, work, gain, G, A, like)
+
+
+def add_step(x, step, work, like):
+    """Add a step, given by parts, to the states; it overwrites the vector part of the quaternion, which is written next."""
+    for c, t in zip(PARTS, step, strict=True):
+        if LANES > 1:
+            put_at(x, 1 + c, value_at(x, 1 + c, like) + t)
+        elif c + 8 <= N:
+            store(x, 1 + c, load_like(x, 1 + c, t) + t)
+        else:
+            for j in STATES[max(c, 3) :]:
+                x[1 + j] = x[1 + j] + entry(step, work, LINE * STEP, j)
 
 
 def rotate_covariance(P, work, gain, G, A, like):
     """Subtract Σ g gᵀ from P, and transform the attitude by G and the carried vectors by A."""
     groups = ((AXES, G), *((v, A) for v in STRUCTURE.vectors))
-    half = {}
+    half, whole = {}, {}
     for m, (v, T) in enumerate(groups):
         for first in PARTS if LANES == 1 else STATES:
             if first in PLAIN or LANES == 1 or any(first in w for w, _ in groups[m:]):
@@ -1182,19 +1209,28 @@ def rotate_covariance(P, work, gain, G, A, like):
                         put_part(P, v[a], first, half[v[a], first])
     for block in BLOCKS:
         for i in PLAIN:
-            for first in block:
-                if first >= i or LANES == 1:
-                    put_part(P, i, first, reduced(P, work, gain, i, first, like))
-    for i in ROTATED if LANES == 1 else ():
-        for j in PLAIN:
-            put_element(P, i, j, element_at(P, i, j, like))
+            columns = tuple(c for c in block if c >= i or LANES == 1)
+            row = tuple(reduced(P, work, gain, i, c, like) for c in columns)  # read as a whole before it is written
+            # Of one run, with the columns that rotate: a store of a number takes as long as that of a part.
+            rotated = tuple((j, element_at(P, j, i, like)) for j in ROTATED) if LANES == 1 else ()
+            for c, t in zip(columns, row, strict=True):
+                put_part(P, i, c, with_entries(t, c, rotated))
     for m, (v, _) in enumerate(groups):
         for w, T in groups[m:]:
             old = tuple(tuple(element_at(P, i, j, like) if LANES == 1 else half[i, j] for j in w) for i in v)
             for a in AXES:
                 for d in AXES:
                     if w[d] >= v[a] or w != v:
-                        put_element(P, v[a], w[d], products(old[a], T[3 * d : 3 * d + 3]))
+                        whole[v[a], w[d]] = whole[w[d], v[a]] = products(old[a], T[3 * d : 3 * d + 3])
+    for i in ROTATED:
+        if LANES == 1:
+            entries = tuple((j, whole[i, j]) for j in ROTATED)
+            for c in sorted({j - j % 8 for j in ROTATED}):
+                put_part(P, i, c, with_entries(half[i, c], c, entries))
+        else:
+            for j in ROTATED:
+                if j >= i:
+                    put_element(P, i, j, whole[i, j])
 
 
 # ---------------------------------------------------------------------------------------- very precise measurements, by Joseph's form
@@ -1325,12 +1361,12 @@ def take_precisely(x, P, work, rows, like):
     return any_lane(lost)
 
 
-def take_precisely_in_lanes(body, gain, steps, precise, rows, like):
+def take_precisely_in_lanes(body, gain, step, precise, rows, like):
     """Update by both forms, Joseph's for the runs that are precise."""
     x, P = body.x, body.P
     copy_values(x[0], x[1], N + 1, like)
     copy_values(P[0], P[1], SIZE_OF_P // LANES, like)
-    apply_gains(x[0], P[0], body.work, gain, steps, like)
+    apply_gains(x[0], P[0], body.work, gain, step, like)
     lost = take_precisely(x[1], P[1], body.work, rows, like)
     blend_values(x[1], x[0], precise, N + 1, like)
     blend_values(P[1], P[0], precise, SIZE_OF_P // LANES, like)
@@ -1351,7 +1387,11 @@ def blend_values(a, b, condition, count, like):
 
 def apply_step(x, P, work, like):
     """Correct the state by the step in the work space, and transform the covariance."""
-    correct_by(x, P, work, (), tuple_at(work, LINE * STEP, N, like), like)
+    step = tuple(
+        load_like(work, LINE * STEP + c, lanes_of(EIGHT)) if LANES == 1 else value_at(work, LINE * STEP + c, like)
+        for c in PARTS
+    )
+    correct_by(x, P, work, (), step, like)
 
 
 # --------------------------------------------------------------------------------------- updates by shape, which is known while compiling
@@ -1378,7 +1418,7 @@ def take_{s}(body, measured, e, innovation, like):
     if any_lane(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
         return {precise}
-    apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
+    apply_gains(body.x[0], body.P[0], body.work, g.gain, g.step, like)
     return False
 
 
@@ -1405,7 +1445,7 @@ def judge_{s}(body, measured, e, options, like):
             divide_variances(body.work, {rows}, weight, like)
             lost = take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
         else:
-            apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
+            apply_gains(body.x[0], body.P[0], body.work, g.gain, g.step, like)
     return outcome, weight, errors, variances, lost
 
 
@@ -1436,7 +1476,7 @@ def _dispatch(name: str, arguments: str, otherwise: str) -> str:
 # In lanes a run that needs Joseph's form must not change the bits of those beside it.
 _PRECISE = {
     True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
-    False: "take_precisely_in_lanes(body, g.gain, g.steps, g.precise, {rows}, like)",
+    False: "take_precisely_in_lanes(body, g.gain, g.step, g.precise, {rows}, like)",
 }[LANES == 1]
 _NIS = "put_at(innovation, 6, g.nis)" if LANES > 1 and not PARAMETERS else ""
 _SOURCE = "\n".join(

@@ -67,6 +67,13 @@ def element(array, place):
     return np.lib.stride_tricks.as_strided(array, (2,), (int(place) * array.itemsize,))[1]
 
 
+def with_lane(x, place, value):
+    """Return lanes with another number in one of them, whose place is known while compiling."""
+    x = x.copy()
+    x[place] = value
+    return x
+
+
 def narrowed(x, like):
     """Return doubles in the precision of ``like``."""
     return np.asarray(x, np.asarray(like).dtype)[()]

@@ -335,8 +335,12 @@ def _lanes_of(target: Any, builder: Any, sig: Any, pattern: Any) -> Any:
 def _align_stack(builder: Any) -> None:
     """Align the stack to cache lines: spilled vectors that cross two lines cost more than the arithmetic.
 
-    A stack frame has the strictest alignment of its variables, so an aligned one is made; an empty inline assembly keeps it.
+    A stack frame has the strictest alignment of its variables, so an aligned one is made, once in a function; an empty inline assembly
+    keeps it.
     """
+    if hasattr(builder.function, "stack_is_aligned"):
+        return
+    builder.function.stack_is_aligned = True
     place = cgutils.alloca_once(builder, ir.ArrayType(ir.IntType(8), 64))
     place.align = 64
     builder.asm(ir.FunctionType(ir.VoidType(), [place.type]), "", "r", [place], side_effect=True)
@@ -345,6 +349,11 @@ def _align_stack(builder: Any) -> None:
 @_instead_of(lane_values.broadcast, lambda x: Lanes(x, WIDTH)(x))
 def _spread_over_lanes(target: Any, builder: Any, sig: Any, x: Any) -> Any:
     return _spread(builder, x, _vector(sig.return_type))
+
+
+@_instead_of(lane_values.with_lane, lambda x, place, value: x(x, types.intp, x.dtype))
+def _with_lane(target: Any, builder: Any, sig: Any, x: Any, place: Any, value: Any) -> Any:
+    return builder.insert_element(x, value, place)
 
 
 @_instead_of(lane_values.narrowed, lambda x, like: _like(getattr(like, "dtype", like), x)(x, like))

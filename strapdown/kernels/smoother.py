@@ -22,17 +22,16 @@ from strapdown.kernels.filter import (
     fill_coefficients,
     fixed_turn,
     gather_noisy_columns,
-    minus_noisy_row,
     minus_row,
-    noisy_row_at,
     predict_state,
-    put_noisy_row,
     put_row,
     rotate_vectors,
     row_at,
     rows_of_noisy,
     rows_to_noisy,
+    scale_noisy_row,
     scatter_noisy_columns,
+    subtract_noisy_row,
     transform,
     turn_attitude,
     turn_vectors,
@@ -47,17 +46,16 @@ OPEN = (
     "apply_transition",
     "fill_coefficients",
     "gather_noisy_columns",
-    "minus_noisy_row",
     "minus_row",
-    "noisy_row_at",
     "predict_state",
-    "put_noisy_row",
     "put_row",
     "rotate_vectors",
     "row_at",
     "rows_of_noisy",
     "rows_to_noisy",
+    "scale_noisy_row",
     "scatter_noisy_columns",
+    "subtract_noisy_row",
     "transform",
     "turn_attitude",
     "turn_vectors",
@@ -142,7 +140,7 @@ def factorise(A, n, width):
     for i in range(n):
         row = row_at(A, i)
         for k in range(i):
-            row = minus_row(row, A, k, A[width * k + i])
+            row = minus_row(row, A[width * k + i], row_at(A, k))
         put_row(A, i, 1.0, row)
         inverted = 1.0 / math.sqrt(A[width * i + i])
         put_row(A, i, inverted, row)
@@ -150,27 +148,34 @@ def factorise(A, n, width):
 
 
 def solve(U, B, n, width):
-    """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``."""
+    """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``.
+
+    Each row of X is subtracted from the others as soon as it is known: these do not wait for each other, as terms of a sum would.
+    """
     for i in range(n):
-        row = noisy_row_at(B, i)
-        for k in range(i):
-            row = minus_noisy_row(row, B, k, U[width * k + i])
-        put_noisy_row(B, i, U[width * i + i], row)
+        row = scale_noisy_row(B, i, U[width * i + i])
+        for k in range(i + 1, n):
+            subtract_noisy_row(B, k, U[width * i + k], row)
     for i in range(n - 1, -1, -1):
-        row = noisy_row_at(B, i)
-        for k in range(n - 1, i, -1):
-            row = minus_noisy_row(row, B, k, U[width * i + k])
-        put_noisy_row(B, i, U[width * i + i], row)
+        row = scale_noisy_row(B, i, U[width * i + i])
+        for k in range(i - 1, -1, -1):
+            subtract_noisy_row(B, k, U[width * k + i], row)
 
 
 def subtract_products(gain, A, B, n, noisy):
-    """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise."""
+    """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise; three rows at once."""
     width = len(gain) // n
-    for r in range(noisy):
-        row = row_at(B, r)
+    for r in range(0, noisy, 3):
+        s, t = min(r + 1, noisy - 1), min(r + 2, noisy - 1)
+        first, second, third = row_at(B, r), row_at(B, s), row_at(B, t)
         for k in range(n):
-            row = minus_row(row, A, k, gain[width * k + r])
-        put_row(B, r, 1.0, row)
+            row = row_at(A, k)
+            first = minus_row(first, gain[width * k + r], row)
+            second = minus_row(second, gain[width * k + s], row)
+            third = minus_row(third, gain[width * k + t], row)
+        put_row(B, r, 1.0, first)
+        put_row(B, s, 1.0, second)
+        put_row(B, t, 1.0, third)
 
 
 def step_back(segments, k, models, space):

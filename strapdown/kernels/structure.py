@@ -184,8 +184,8 @@ class Gains(NamedTuple):
 
     gain: tuple[Any, ...]
     """g of each row: P h, given the rows before it, over the root of its innovation's variance."""
-    steps: tuple[Any, ...]
-    """Innovation of each row over the same root."""
+    step: tuple[Any, ...]
+    """Correction of the state, by parts."""
     errors: tuple[Any, ...]
     """Innovations, and their variances."""
     variances: tuple[Any, ...]

@@ -13,7 +13,7 @@ uncertain as over a gap, and the other sensors' samples there are left out (:fun
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -123,9 +123,7 @@ def find(recording: Recording) -> Faults:
             f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
             "each according to the change of the rate in that time"
         )
-    if changes:
-        recording = replace(recording, **changes)
-    return Faults(recording=recording, turn_variance=variance, words=tuple(words))
+    return Faults(recording=recording.corrected(**changes), turn_variance=variance, words=tuple(words))
 
 
 def interpolated(rate: Array) -> list[tuple[int, int]]:

@@ -38,8 +38,8 @@ class Run(NamedTuple):
     setup: FilterSetup
     """The filter without gate and weights."""
     initial: State
-    calibration: UnitCalibration | None = None
-    """Calibration of the unit that a recording yields."""
+    recorded: ahrs.AhrsEstimate | None = None
+    """Result for a recording."""
 
 
 def estimate(
@@ -310,4 +310,4 @@ def _run_recording(
             "magnetometer_latency": result.delays.last_field,
         },
     )
-    return Run(estimate, result.record, parameters.setup, result.initial, result.calibration)
+    return Run(estimate, result.record, parameters.setup, result.initial, result)
