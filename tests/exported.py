@@ -132,12 +132,12 @@ class Plain:
 
 
 class Compiled:
-    """The filter in C, compiled into a library: once for a program."""
+    """The filter in C, compiled into a library: once for a program. An optimising compiler takes three times as long."""
 
     _sources: ClassVar[dict[Any, tuple[Any, dict[str, str]]]] = {}
     _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
-    def __init__(self, program, folder, *, single=False, flags=("-O1",)):
+    def __init__(self, program, folder, *, single=False, flags=("-O0",)):
         folder = Path(folder)
         if (id(program), single) not in self._sources:
             self._sources[id(program), single] = program, c.files(program, "test", single=single)

@@ -135,12 +135,13 @@ def studied(out: Path) -> tuple[object, ...]:
 
 
 @pytest.fixture(scope="module")
-def coning(tmp_path_factory) -> tuple[Path, dict, str]:
+def coning(tmp_path_factory, blank) -> tuple[Path, dict, str]:
     """One small study, with two algorithms of one's own: its folder, its JSON and what was printed."""
     out = tmp_path_factory.mktemp("coning") / "results"
     own = '[algorithm]\nname = "rounded"\ncoefficients = [0.5143, 0.8762, 2.0381]\n'
     out.with_name("own.toml").write_text(own, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure.savefig", blank)
         patch.setattr(sys, "argv", ["strapdown", "coning", *map(str, studied(out)), "--out", str(out)])
         with cli.console.capture() as said, pytest.raises(SystemExit) as end:
             cli.main()

@@ -18,7 +18,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.scenarios import Scenario, load_scenario, simulate
+from strapdown.scenarios import Scenario, load_scenario, scenario_to_toml, simulate
 from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import Faults
 
@@ -790,7 +790,9 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
 
 
 def test_the_command_gives_no_verdict_beyond_the_linear_range(run, succeeds, tmp_path):
-    said = succeeds("covariance", "rest", "--epochs", 4, "--no-states")
+    short = dataclasses.replace(load_scenario("rest"), duration=3600.0)
+    (tmp_path / "rest.toml").write_text(scenario_to_toml(short), encoding="utf-8")
+    said = succeeds("covariance", "rest.toml", "--epochs", 4, "--no-states")
     assert "will be consistent" in said
     assert "linear about the truth, cannot tell whether the filter will be consistent" in said
     assert "The filter will be" not in said

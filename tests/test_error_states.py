@@ -386,14 +386,18 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
     assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
 
 
-@pytest.mark.parametrize("option", ["all", pytest.param("a foreign block", marks=pytest.mark.slow)])
-def test_a_split_run_is_the_whole_run_to_the_bit(option):
+@pytest.mark.parametrize(
+    ("option", "at"),
+    [("all", 77), ("none", 1), ("none", 77), ("none", -1), pytest.param("a foreign block", 77, marks=pytest.mark.slow)],
+)
+def test_a_split_run_is_the_whole_run_to_the_bit(option, at):
     record, blocks = record_of(anisotropic=option == "all"), OPTIONS[option]
+    n = len(record.increments)
     whole, end = estimation.run_part(record, NOISE, start(), blocks, full_covariance=True)
-    first, middle = estimation.run_part(records.cut(record, 0, 77), NOISE, start(), blocks, full_covariance=True)
-    rest = records.cut(record, 77, len(record.increments))
+    first, middle = estimation.run_part(records.cut(record, 0, at % n), NOISE, start(), blocks, full_covariance=True)
+    rest = records.cut(record, at % n, n)
     second, last = estimation.run_part(rest, NOISE, middle, blocks, full_covariance=True)
-    for name in ("attitude", "bias", "variance", "whole_covariance"):
+    for name in ("attitude", "bias", "variance", "whole_covariance" if blocks else "covariance"):
         joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
         assert np.array_equal(joined, getattr(whole, name)), name
     assert np.array_equal(last.covariance, end.covariance)

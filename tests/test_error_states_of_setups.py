@@ -328,7 +328,10 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
     scenario = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=4000.0)
     iron = np.array([2e-6, -1.5e-6, 1e-6])
     sensors = tuple(dataclasses.replace(s, hard_iron=iron) if s.name == "magnetometer" else s for s in scenario.sensors)
-    scenario = dataclasses.replace(scenario, sensors=sensors)
+    noise = {
+        name: getattr(scenario.gyro, name) for name in ("angle_random_walk", "rate_random_walk", "turn_on_bias_sigma")
+    }
+    scenario = dataclasses.replace(scenario, sensors=sensors, gyro=GyroSpec(**noise), gyro_preset="")
     filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     own = filter_setup.states.sensors["magnetometer"]
     assert own.varying

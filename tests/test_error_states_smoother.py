@@ -270,7 +270,7 @@ def slow(kinds, *which):
     return [pytest.param(kind, marks=pytest.mark.slow if kind in which else []) for kind in kinds]
 
 
-@pytest.mark.parametrize("kind", slow(KINDS, "gyro force", "scale", "lever arm"))
+@pytest.mark.parametrize("kind", slow(KINDS, "gyro force", "scale", "coloured, body axes", "lever arm"))
 def test_the_smoother_is_least_squares_to_first_order(kind):
     """Of the whole trajectory, prior and gyro noise and measurements together, by Gauss–Newton.
 

@@ -1,5 +1,6 @@
 """Lanes: the machine vectors do what NumPy does lane by lane, a kernel over them does what it does on floats, on any width of machine."""
 
+import functools
 import math
 import operator
 import os
@@ -53,6 +54,7 @@ A = RANDOM.standard_normal(WIDTH)
 B = RANDOM.standard_normal(WIDTH)
 
 
+@functools.cache
 def kernel(function: FunctionType) -> object:
     """Compile a function of this file as if it lived among the kernels."""
     twin = FunctionType(function.__code__, function.__globals__, function.__name__, None, function.__closure__)

@@ -254,6 +254,13 @@ def _forged(path, name, value):
         file.attrs[name] = value
 
 
+@pytest.fixture(scope="module")
+def of_21_runs(tmp_path_factory):
+    path = tmp_path_factory.mktemp("campaign") / "c.h5"
+    go(path, 21)
+    return path
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -274,10 +281,8 @@ def _forged(path, name, value):
         ({"runs": 0}, "runs is 0"),
     ],
 )
-def test_a_file_of_another_campaign_is_refused_and_left_as_it_is(tmp_path, changes, message):
-    path = tmp_path / "c.h5"
-    go(path, 21)
-    before = path.read_bytes()
+def test_a_file_of_another_campaign_is_refused_and_left_as_it_is(of_21_runs, changes, message):
+    path, before = of_21_runs, of_21_runs.read_bytes()
     options = {"runs": 30, "plan": PLAN, **changes}
     with pytest.raises(InputError, match=message):
         go(path, resume=True, **options)

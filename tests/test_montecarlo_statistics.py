@@ -509,7 +509,7 @@ def test_memory_does_not_grow_with_the_runs():
         return most
 
     peak(4)
-    assert (peak(120) - peak(40)) / 40 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
+    assert (peak(60) - peak(20)) / 20 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
 
 
 def test_chunks_are_not_listed():

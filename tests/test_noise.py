@@ -160,7 +160,7 @@ def lane_normals(runs, count, width=8, key=(5, 6)):
 
 @pytest.fixture(scope="module")
 def sample():
-    return normals(0, 4_000_000)
+    return normals(0, 2_000_000)
 
 
 @pytest.fixture(scope="module")

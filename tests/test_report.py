@@ -57,7 +57,7 @@ def panels():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, scenario, filter_setup, blank, panels):
-    """Results: an estimate with truth, one without, one of a filter that is wrong, a campaign; figures of the first and the last."""
+    """Results: an estimate with truth, one without, one of a filter that is wrong, a campaign; figures of the first."""
     where, drawn, new = tmp_path_factory.mktemp("results"), [], plots.new_figure
 
     def kept(*size, **options):
@@ -77,7 +77,7 @@ def folder(tmp_path_factory, scenario, filter_setup, blank, panels):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plots, "new_figure", kept)
         for name in ("right", "campaign", "blind", "wrong"):
-            if name == "blind":
+            if name == "campaign":
                 patch.setattr(Figure, "savefig", blank)
             drawn.clear()
             if name == "wrong":

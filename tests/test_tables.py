@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,6 +94,10 @@ def test_latex_rounds_and_aligns():
     assert body[1][1] == "$-62.39$"
 
 
+DRAWN = ("allan", "covariance")
+"""One command for each format; of the other commands only the names of the figures are looked at."""
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Each command once, with --tables, and --format where it draws: its folder by the command's name."""
@@ -115,7 +120,9 @@ def written(tmp_path_factory):
     }
     for name, options in commands.items():
         tables = [] if name in ("simulate", "estimate") else ["--tables", where / "tables" / name]
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+            if name not in DRAWN:
+                patch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, **options: Path(path).touch())
             if name == "coning":
                 warnings.simplefilter("error")  # a study as short as can be warns of nothing
             result = CliRunner().invoke(cli.app, [str(part) for part in [name, *options, *tables]])
@@ -188,23 +195,18 @@ def test_tables_hold_the_numbers_of_the_json(written):
 
 
 def test_figures_are_written_in_the_format_asked_for(written):
-    signatures = {
-        str(path.relative_to(written)): path.read_bytes()[:5]
-        for path in written.rglob("*")
-        if path.suffix in (".png", ".pdf", ".svg")
-    }
+    figures = {str(path.relative_to(written)) for path in written.rglob("*") if path.suffix in (".png", ".pdf", ".svg")}
     svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood", "filter-heldout"}
     pdf = {"covariance/budget", "estimate/estimate", "estimate/errors"}
-    assert signatures == {
-        **dict.fromkeys((f"{x}.svg" for x in svg), b"<?xml"),
-        **dict.fromkeys((f"{x}.pdf" for x in pdf), b"%PDF-"),
-    }
+    assert figures == {*(f"{x}.svg" for x in svg), *(f"{x}.pdf" for x in pdf)}
+    assert (written / "allan" / "allan.svg").read_bytes().startswith(b"<?xml")
+    assert (written / "covariance" / "budget.pdf").read_bytes().startswith(b"%PDF-")
 
 
 def test_a_report_shows_svg_and_names_pdf(written, tmp_path):
     from strapdown.report import page
 
-    shutil.copy(written / "filter-likelihood.svg", tmp_path / "errors.svg")
+    shutil.copy(written / "allan" / "allan.svg", tmp_path / "errors.svg")
     assert "data:image/svg+xml;base64," in page.stored_figure(tmp_path / "errors", "errors")
     (tmp_path / "errors.pdf").write_bytes(b"%PDF-")
     content = page.stored_figure(tmp_path / "errors", "errors")

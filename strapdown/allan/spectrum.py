@@ -187,10 +187,11 @@ def scored(
     from scipy.optimize import nnls
 
     fit, held = at(start), np.where(free, 0.0, start) @ bins.basis
+    basis, root = bins.basis[free], np.sqrt(bins.number)
     for _ in range(MAX_PASSES if free.any() else 0):
-        weight = np.sqrt(bins.number) / fit.variance
-        design = (bins.basis[free] * weight).T
-        norm = np.linalg.norm(design, axis=0)
+        weight = root / fit.variance
+        design = (basis * weight).T
+        norm = np.sqrt((design * design).sum(axis=0))
         target = start.copy()
         target[free] = nnls(design / norm, (power(fit) / bins.number - held) * weight)[0] / norm
         step, trial = 1.0, at(target)

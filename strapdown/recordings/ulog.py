@@ -99,27 +99,39 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
 
 
 SECONDS, SECONDS_PER_MB = 2.0, 2.0
-"""Maximum time of the processor that the library may take for a log, more than ten times the usual: on damaged bytes it may go back and
-forth for ever."""
+"""Maximum time of the processor that the library may take for a log, more than ten times the usual."""
 LONGEST = 65535
 """Maximum number of fields of a message, whose length is a number of 16 bits."""
 
 
 class _Content(io.BytesIO):
-    """The content of a log, with a limit on the time that its reading takes."""
+    """The content of a log whose reading ends: within a limit of time, and never going back to before a message that was just read."""
 
     def __init__(self, content: bytes) -> None:
         super().__init__(content)
         self._until = time.thread_time() + SECONDS + SECONDS_PER_MB * len(content) / 1e6
+        self._header = self._body = 0  # bytes that the last two calls of read returned
 
     def read(self, size: int | None = -1, /) -> bytes:
         if time.thread_time() > self._until:
-            raise _TooLongError(f"the library does not come to an end at byte {self.tell()}")
-        return super().read(size)
+            raise self._too_long()
+        content = super().read(size)
+        self._header, self._body = self._body, len(content)
+        return content
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        # After a damaged message the library goes back by the size that the message declares. Where the log ends before that, it would
+        # go back further than it came, for ever.
+        if whence == 1 and -offset > self._header + self._body:
+            raise self._too_long()
+        return super().seek(offset, whence)
+
+    def _too_long(self) -> _TooLongError:
+        return _TooLongError(f"the library does not come to an end at byte {self.tell()}")
 
 
 class _TooLongError(Exception):
-    """The library takes too long; it handles all usual exceptions as damage."""
+    """The library does not come to an end; it handles all usual exceptions as damage."""
 
 
 def opened(file: Path, topics: list[str]) -> Any:
