@@ -16,6 +16,7 @@ from strapdown.ahrs import AhrsParameters, estimating, regions, remarks, startin
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import setup
+from strapdown.estimation.states import changed
 from strapdown.kernels import headings as kernels
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -515,7 +516,7 @@ def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():
         values=np.zeros(2),
     )
     rate, sigma = np.array([0.02, -0.01, 0.03]), 5e-3
-    posterior = state.changed(lambda x, P: starting.take_rate_at_rest(x, P, rate, sigma))
+    posterior = changed(state, lambda x, P: starting.take_rate_at_rest(x, P, rate, sigma))
     H = np.eye(8)[3:6]
     expected = np.linalg.inv(np.linalg.inv(state.covariance) + H.T @ H / sigma**2)
     change = expected @ H.T @ rate / sigma**2

@@ -17,7 +17,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.observability import state_names, without_errors
-from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.states import ProcessNoise, changed
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine, six_states, smoother, structure
@@ -424,7 +424,7 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
     state, first, parts = start(), 0, []
     for last, change in spans:
         part, end = estimation.run_part(records.cut(record, first, last), NOISE, state, blocks, **options)
-        state, first = end.changed(change) if change else end, last
+        state, first = changed(end, change) if change else end, last
         parts.append(part)
     for name in ("attitude", "bias", "variance", "covariance"):
         joined = np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])

@@ -29,6 +29,7 @@ from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
+from strapdown.estimation.states import changed
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults
@@ -215,7 +216,7 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
         P[[0, 1, 2], [0, 1, 2]] += added[edge]
 
     bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()
-    state = prepared.initial.changed(functools.partial(change, 0))
+    state = changed(prepared.initial, functools.partial(change, 0))
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
         spans = [estimation.Span(last, functools.partial(change, last)) for last in bounds[1:]]
@@ -235,7 +236,7 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
         parts.append(smoothed)
         if last < bounds[-1]:
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
-            state = state.changed(functools.partial(change, last))
+            state = changed(state, functools.partial(change, last))
     return joined(parts)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.estimation.states import changed
 from strapdown.kernels import first_state, recording_samples
 from strapdown.kernels import rests as kernel
 from strapdown.kernels.machine import compiled, read_only
@@ -281,4 +282,4 @@ def with_all_rests(
         total = information + sigma**-2
         mean, information, after = (information * mean + sigma**-2 * rate) / total, total, time[last]
     sigma = float(np.sqrt(1.0 / information + walk * (after - time[0])))
-    return state.changed(functools.partial(take_rate_at_rest, rate=mean, sigma=sigma))
+    return changed(state, functools.partial(take_rate_at_rest, rate=mean, sigma=sigma))

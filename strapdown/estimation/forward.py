@@ -28,6 +28,7 @@ from strapdown.estimation.states import (
     GateMemory,
     ProcessNoise,
     State,
+    changed,
     check_arguments,
     covariance_matrices,
     first_bias_variance,
@@ -298,7 +299,7 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
             state, before = passed.end, mean
         if span.change is not None:
             at_edge = temperature.shifted(state, slopes, float(T[span.last]) - before)
-            state, before = at_edge.changed(span.change), float(T[span.last])
+            state, before = changed(at_edge, span.change), float(T[span.last])
         begin = span.last
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
     estimate = joined(parts)
@@ -417,7 +418,7 @@ def put_state(body: six_states.Body | structure.Body, state: State) -> None:
 def change_state(body: six_states.Body | structure.Body, change: Change) -> None:
     """Change the state in the arrays of a kernel."""
     if isinstance(body, six_states.Body):
-        put_state(body, state_of_numbers(body.state).changed(change))
+        put_state(body, changed(state_of_numbers(body.state), change))
         return
     n = body.x.shape[1] - 1
     change(body.x[0], body.P[0].reshape(n, -1)[:, :n])

@@ -129,15 +129,16 @@ class State:
         size = 6 + len(values)
         object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
 
-    def changed(self, change: Change) -> State:
-        """Return the state after a change."""
-        x, P = np.concatenate([self.attitude, self.bias, self.values]), np.array(self.covariance)
-        change(x, P)
-        return replace(self, attitude=x[:4], bias=x[4:7], values=x[7:], covariance=P)
-
 
 Change = Callable[[Array, Array], None]
 """A change in place of attitude, bias and error states (7 + m,) and of their covariance."""
+
+
+def changed(state: State, change: Change) -> State:
+    """Return a state after a change."""
+    x, P = np.concatenate([state.attitude, state.bias, state.values]), np.array(state.covariance)
+    change(x, P)
+    return replace(state, attitude=x[:4], bias=x[4:7], values=x[7:], covariance=P)
 
 
 def initial_state(

@@ -21,7 +21,7 @@ import numpy as np
 from strapdown.checks import Array, median
 from strapdown.kernels import recording_samples
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import Recording
+from strapdown.records.recording import Recording, corrected
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
@@ -123,7 +123,7 @@ def find(recording: Recording) -> Faults:
             f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
             "each according to the change of the rate in that time"
         )
-    return Faults(recording=recording.corrected(**changes), turn_variance=variance, words=tuple(words))
+    return Faults(recording=corrected(recording, **changes), turn_variance=variance, words=tuple(words))
 
 
 def interpolated(rate: Array) -> list[tuple[int, int]]:

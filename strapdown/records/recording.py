@@ -155,13 +155,6 @@ class Recording(Listed):
         steps = np.sort(np.diff(self.time))  # of nearly equal numbers, to select one takes seven times as long
         return float(0.5 * (steps[(len(steps) - 1) // 2] + steps[len(steps) // 2]))
 
-    def corrected(self, **samples: Array) -> Recording:
-        """Return the recording with other samples at the same stamps, which are not checked again."""
-        result = copy.copy(self)
-        for name, values in samples.items():
-            object.__setattr__(result, name, values)
-        return result
-
     def since(self, first: int) -> Recording:
         """Return the recording from a given sample on.
 
@@ -335,6 +328,14 @@ def increments(recording: Recording) -> Array:
     polynomials of higher order.
     """
     return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
+
+
+def corrected(recording: Recording, **samples: Array) -> Recording:
+    """Return the recording with other samples at the same stamps, which are not checked again."""
+    result = copy.copy(recording)
+    for name, values in samples.items():
+        object.__setattr__(result, name, values)
+    return result
 
 
 def sampled(samples: Array) -> np.ndarray:
