@@ -22,6 +22,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
 from strapdown.report import comparisons, page
+from strapdown.results import Table
 from strapdown.tuning import fitting
 from strapdown.units import DEGREE_PER_HOUR
 
@@ -555,6 +556,28 @@ def rows_of(content, first):
     """Numbers of the row of a table whose first cell begins so."""
     row = next(row for row in re.findall(r"<tr>(.*?)</tr>", content) if re.match(rf"<td[^>]*>{first}", row))
     return [float(cell) for cell in re.findall(r'<td class="number">(.*?)</td>', row)]
+
+
+def test_names_stand_as_code_and_words_at_the_left():
+    assert page.paragraph("give `states=True` & `holdout=`") == (
+        "<p>give <code>states=True</code> &amp; <code>holdout=</code></p>"
+    )
+    rows = [("a", 1.0, "rounding", "cannot tell", None), ("b", None, "−2.1", "consistent", "0.9 to 1.1")]
+    content = page.table(Table("", ("filter", "NIS", "drift", "verdict", "bounds"), rows))
+    right = [" class=" in cell for cell in re.findall(r"<t[hd][^>]*>", content.partition("<tr>")[2])]
+    assert right == [False, True, True, False, True] * 3
+
+
+def test_a_stored_figure_suits_the_theme(tmp_path):
+    if headless.CHROMIUM is None:
+        pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
+    Figure(figsize=(4.0, 3.0)).savefig(tmp_path / "errors.png")
+    figure = page.stored_figure(tmp_path / "errors", "Errors")
+    (tmp_path / "page.html").write_text(page.page("A figure", "", figure), encoding="utf-8")
+    probe = 'addEventListener("load", () => { document.title = JSON.stringify({look: getComputedStyle(document.images[0]).filter}); });'
+    for theme, look in ((1, "none"), (0, "invert(0.9) hue-rotate(180deg)")):  # light, dark
+        option = f"--blink-settings=preferredColorScheme={theme}"
+        assert headless.reported(tmp_path / "page.html", probe, 600, option)["look"] == look
 
 
 def test_the_tables_of_the_estimates_page_are_those_of_the_terminal(folder):

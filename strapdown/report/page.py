@@ -69,6 +69,11 @@ def text(content: Any) -> str:
     return html.escape(str(content))
 
 
+def prose(content: Any) -> str:
+    """Return text escaped for HTML, what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text(content))
+
+
 def section(title: str, *parts: str) -> str:
     """Return a section with a heading."""
     anchor = re.sub(r"\W+", "-", title.lower()).strip("-")
@@ -83,8 +88,8 @@ def _contents(parts: Sequence[str]) -> str:
 
 
 def paragraph(content: str, *, faint: bool = False) -> str:
-    """Return a paragraph of plain text."""
-    return f"<p{' class=faint' if faint else ''}>{text(content)}</p>"
+    """Return a paragraph of text."""
+    return f"<p{' class=faint' if faint else ''}>{prose(content)}</p>"
 
 
 def code(content: str) -> str:
@@ -94,16 +99,19 @@ def code(content: str) -> str:
 
 MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
 """Classes of cells by their text."""
+_NUMBER = re.compile(r"[-+−±×<>≤≥ ]*[\d∞]|-$")
+"""Begin of a cell with a number, or a missing one."""
 
 
 def table(content: Table) -> str:
     """Return a table and its notes, without its title; it scrolls on a narrow page, or without numbers wraps its text."""
-    kinds = [' class="number"' if k >= content.left else "" for k in range(len(content.head))]
+    filled = [any(_NUMBER.match(row[k]) for row in content.cells) for k in range(len(content.head))]
+    kinds = [' class="number"' if k >= content.left and filled[k] else "" for k in range(len(filled))]
     heads = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
     lines = [f"<tr>{heads}</tr>"]
     for row in content.cells:
         own = [f' class="{MARKS[cell]}"' if cell in MARKS else kind for kind, cell in zip(kinds, row, strict=True)]
-        cells = "".join(f"<td{kind}>{text(cell)}</td>" for kind, cell in zip(own, row, strict=True))
+        cells = "".join(f"<td{kind}>{prose(cell)}</td>" for kind, cell in zip(own, row, strict=True))
         lines.append(f"<tr>{cells}</tr>")
     frame = 'class="scroll" tabindex="0"' if any(kinds) else 'class="wrap"'  # the arrow keys scroll what has the focus
     notes = (paragraph(note, faint=True) for note in content.notes)
@@ -153,7 +161,7 @@ def stored_figure(stem: Path, caption: str) -> str:
             if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
             data = base64.b64encode(content).decode()
-            image = f'<img src="data:{kind};base64,{data}" alt="{text(caption)}">'
+            image = f'<img class="paper" src="data:{kind};base64,{data}" alt="{text(caption)}">'
             return section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
     return ""
 
@@ -256,10 +264,10 @@ def _compressed(integers: NDArray[Any]) -> str:
 def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
     """Return the verdict box: the verdict, its reason, and findings against it."""
     kind = {"consistent": "consistent", "not consistent": "not"}.get(answer, "cannot")
-    items = "".join(f"<li>{text(detail)}</li>" for detail in details)
+    items = "".join(f"<li>{prose(detail)}</li>" for detail in details)
     listing = f"<ul>{items}</ul>" if items else ""
     said = f"{reason[:1].upper()}{reason[1:]}{'' if reason.endswith('.') else '.'}"
-    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(said)}{listing}</div>'
+    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {prose(said)}{listing}</div>'
 
 
 def judged(judgement: Judgement) -> str:
