@@ -104,7 +104,6 @@ def test_a_page_needs_nothing_else(folder, name):
         r"""(src|href|srcset)\s*=\s*["']?(?!data:)[a-z/]""", re.sub(r"<script>.*?</script>", "", content, flags=re.S)
     )
     assert "@import" not in content
-    assert len(re.findall("<figure[ >]", content)) == content.count('prefers-color-scheme: dark)" srcset')
 
 
 @pytest.mark.parametrize(("name", "verdict"), [("right", "cannot tell"), ("wrong", "not consistent")])
@@ -395,7 +394,7 @@ def test_a_chart_of_an_angle_breaks_where_it_wraps():
     assert np.nanmax(np.abs(np.diff(data))) < 180.0
 
 
-PARENTS = {"li": "ul", "tr": "table", "td": "tr", "th": "tr", "figcaption": "figure", "source": "picture"}
+PARENTS = {"li": "ul", "tr": "table", "td": "tr", "th": "tr", "figcaption": "figure"}
 """Elements that stand in one other alone."""
 
 
@@ -632,5 +631,5 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
 
 @pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
 def test_no_panel_of_a_figure_is_empty(folder, panels, name):
-    assert len(panels[name]) >= (2 if name == "campaign" else 4)  # each in two themes
+    assert len(panels[name]) >= (1 if name == "campaign" else 2)
     assert all(all(figure) for figure in panels[name])

@@ -1,4 +1,4 @@
-"""One self-contained HTML page, without network access or other files. Figures in a light and a dark version, interactive charts."""
+"""One self-contained HTML page, without network access or other files. Figures and interactive charts in a light and a dark theme."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -124,22 +125,21 @@ def listed(content: Table) -> str:
 
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
-    """Return a figure, drawn in each theme; the page shows that of the reader's colour scheme."""
-    (light, wide), (dark, _) = (_image(draw, theme) for theme in ("light", "dark"))
-    kind = " class=wide" if wide else ""
-    return (
-        f'<figure{kind}><div class="scroll" tabindex="0"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
-        f'<img src="{light}" alt="{text(caption)}"></picture></div><figcaption>{text(caption)}</figcaption></figure>'
-    )
-
-
-def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
-    """Return a figure as a data URL, and whether it is too wide to be readable when shrunk to a phone."""
-    with style.theme(theme):
-        buffer = io.BytesIO()
+    """Return a figure, drawn in the package's style."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(style.STYLE):
         drawn = draw()
         drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
+    return _image("image/png", buffer.getvalue(), caption, wide=drawn.get_figwidth() > _WIDE)
+
+
+def _image(kind: str, content: bytes, caption: str, *, wide: bool) -> str:
+    """Return a figure of a media type, which the style sheet turns dark in the dark theme."""
+    data = base64.b64encode(content).decode()
+    return (
+        f'<figure{" class=wide" if wide else ""}><div class="scroll" tabindex="0"><img src="data:{kind};base64,{data}" '
+        f'alt="{text(caption)}"></div><figcaption>{text(caption)}</figcaption></figure>'
+    )
 
 
 LARGEST_FIGURE = 50_000_000
@@ -160,9 +160,7 @@ def stored_figure(stem: Path, caption: str) -> str:
             content = reading.content(path, link=False, maximum=LARGEST_FIGURE)
             if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
-            data = base64.b64encode(content).decode()
-            image = f'<img class="paper" src="data:{kind};base64,{data}" alt="{text(caption)}">'
-            return section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
+            return section(caption, _image(kind, content, caption, wide=True))
     return ""
 
 
