@@ -565,6 +565,7 @@ def test_names_stand_as_code_and_words_at_the_left():
     content = page.table(Table("", ("filter", "NIS", "drift", "verdict", "bounds"), rows))
     right = [" class=" in cell for cell in re.findall(r"<t[hd][^>]*>", content.partition("<tr>")[2])]
     assert right == [False, True, True, False, True] * 3
+    assert "<td>One. Two.</td>" in page.provenance({"remarks": ["One.", "Two."]})
 
 
 def test_a_stored_figure_suits_the_theme(tmp_path):

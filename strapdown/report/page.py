@@ -298,9 +298,12 @@ def provenance(attributes: Mapping[str, Any]) -> str:
     short: list[tuple[str, str]] = []
     long: list[tuple[str, str]] = []
     for name, value in attributes.items():
-        content = (
-            f"{value:.6g}" if isinstance(value, float) else str(value.decode() if isinstance(value, bytes) else value)
-        )
+        if isinstance(value, float):
+            content = f"{value:.6g}"
+        elif isinstance(value, list):  # of sentences
+            content = " ".join(map(str, value))
+        else:
+            content = str(value.decode() if isinstance(value, bytes) else value)
         (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
     parts = [table(Table("", ("attribute", "value"), short, left=2))] if short else []
     parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]
