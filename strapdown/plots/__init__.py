@@ -2,7 +2,7 @@
 
 Colours are those of Okabe and Ito, distinguishable with colour vision deficiency. :func:`new_figure` needs no display.
 
-- ``style``: Colours, themes (light, dark), sizes, saving.
+- ``style``: Colours, sizes, saving.
 - ``decimation``: Reduction of long series to the extremes of each pixel column.
 - ``estimates``: One estimate over time: attitude, bias, σ, errors.
 - ``innovations``: Innovations of one record: NIS, distribution, autocorrelation.
@@ -59,7 +59,6 @@ from strapdown.plots.style import (
     new_figure,
     save,
     save_as,
-    theme,
 )
 
 __all__ = ["allan_overview", "error_budget", "error_overview", "nees_over_time", "new_figure", "nis_over_time", "save"]

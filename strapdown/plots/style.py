@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,34 +50,9 @@ STYLE: Any = {
 FORMATS = ("png", "pdf", "svg")
 """File formats of figures."""
 
-_DARK, _LIGHT = "#16181d", "#e4e6eb"
-THEMES: dict[str, Any] = {
-    "light": {},
-    "dark": {
-        "figure.facecolor": _DARK,
-        "axes.facecolor": _DARK,
-        "savefig.facecolor": _DARK,
-        "text.color": _LIGHT,
-        "axes.labelcolor": _LIGHT,
-        "axes.edgecolor": _LIGHT,
-        "xtick.color": _LIGHT,
-        "ytick.color": _LIGHT,
-        "grid.color": _LIGHT,
-    },
-}
-"""Settings of each theme that differ from the default."""
-
-
-@contextlib.contextmanager
-def theme(name: str) -> Iterator[None]:
-    """Use the theme "light" or "dark" for figures drawn in this context."""
-    one_of("theme", name, THEMES)
-    with matplotlib.rc_context({**STYLE, **THEMES[name]}):
-        yield
-
 
 def ink() -> str:
-    """Return the colour of lines and bands that are neither data nor background: black, or light in the dark theme."""
+    """Return the colour of lines and bands that are neither data nor background: black, or light in a dark style of Matplotlib."""
     return str(matplotlib.rcParams["text.color"])
 
 

@@ -1,4 +1,4 @@
-"""One self-contained HTML page, without network access or other files. Figures in a light and a dark version, interactive charts."""
+"""One self-contained HTML page, without network access or other files. Figures and interactive charts in a light and a dark theme."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -69,6 +70,11 @@ def text(content: Any) -> str:
     return html.escape(str(content))
 
 
+def prose(content: Any) -> str:
+    """Return text escaped for HTML, what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text(content))
+
+
 def section(title: str, *parts: str) -> str:
     """Return a section with a heading."""
     anchor = re.sub(r"\W+", "-", title.lower()).strip("-")
@@ -83,8 +89,8 @@ def _contents(parts: Sequence[str]) -> str:
 
 
 def paragraph(content: str, *, faint: bool = False) -> str:
-    """Return a paragraph of plain text."""
-    return f"<p{' class=faint' if faint else ''}>{text(content)}</p>"
+    """Return a paragraph of text."""
+    return f"<p{' class=faint' if faint else ''}>{prose(content)}</p>"
 
 
 def code(content: str) -> str:
@@ -94,16 +100,19 @@ def code(content: str) -> str:
 
 MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
 """Classes of cells by their text."""
+_NUMBER = re.compile(r"[-+−±×<>≤≥ ]*[\d∞]|-$")
+"""Begin of a cell with a number, or a missing one."""
 
 
 def table(content: Table) -> str:
     """Return a table and its notes, without its title; it scrolls on a narrow page, or without numbers wraps its text."""
-    kinds = [' class="number"' if k >= content.left else "" for k in range(len(content.head))]
+    filled = [any(_NUMBER.match(row[k]) for row in content.cells) for k in range(len(content.head))]
+    kinds = [' class="number"' if k >= content.left and filled[k] else "" for k in range(len(filled))]
     heads = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
     lines = [f"<tr>{heads}</tr>"]
     for row in content.cells:
         own = [f' class="{MARKS[cell]}"' if cell in MARKS else kind for kind, cell in zip(kinds, row, strict=True)]
-        cells = "".join(f"<td{kind}>{text(cell)}</td>" for kind, cell in zip(own, row, strict=True))
+        cells = "".join(f"<td{kind}>{prose(cell)}</td>" for kind, cell in zip(own, row, strict=True))
         lines.append(f"<tr>{cells}</tr>")
     frame = 'class="scroll" tabindex="0"' if any(kinds) else 'class="wrap"'  # the arrow keys scroll what has the focus
     notes = (paragraph(note, faint=True) for note in content.notes)
@@ -116,22 +125,21 @@ def listed(content: Table) -> str:
 
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
-    """Return a figure, drawn in each theme; the page shows that of the reader's colour scheme."""
-    (light, wide), (dark, _) = (_image(draw, theme) for theme in ("light", "dark"))
-    kind = " class=wide" if wide else ""
-    return (
-        f'<figure{kind}><div class="scroll" tabindex="0"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
-        f'<img src="{light}" alt="{text(caption)}"></picture></div><figcaption>{text(caption)}</figcaption></figure>'
-    )
-
-
-def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
-    """Return a figure as a data URL, and whether it is too wide to be readable when shrunk to a phone."""
-    with style.theme(theme):
-        buffer = io.BytesIO()
+    """Return a figure, drawn in the package's style."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(style.STYLE):
         drawn = draw()
         drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
+    return _image("image/png", buffer.getvalue(), caption, wide=drawn.get_figwidth() > _WIDE)
+
+
+def _image(kind: str, content: bytes, caption: str, *, wide: bool) -> str:
+    """Return a figure of a media type, which the style sheet turns dark in the dark theme."""
+    data = base64.b64encode(content).decode()
+    return (
+        f'<figure{" class=wide" if wide else ""}><div class="scroll" tabindex="0"><img src="data:{kind};base64,{data}" '
+        f'alt="{text(caption)}"></div><figcaption>{text(caption)}</figcaption></figure>'
+    )
 
 
 LARGEST_FIGURE = 50_000_000
@@ -152,9 +160,7 @@ def stored_figure(stem: Path, caption: str) -> str:
             content = reading.content(path, link=False, maximum=LARGEST_FIGURE)
             if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
-            data = base64.b64encode(content).decode()
-            image = f'<img src="data:{kind};base64,{data}" alt="{text(caption)}">'
-            return section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
+            return section(caption, _image(kind, content, caption, wide=True))
     return ""
 
 
@@ -256,10 +262,10 @@ def _compressed(integers: NDArray[Any]) -> str:
 def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
     """Return the verdict box: the verdict, its reason, and findings against it."""
     kind = {"consistent": "consistent", "not consistent": "not"}.get(answer, "cannot")
-    items = "".join(f"<li>{text(detail)}</li>" for detail in details)
+    items = "".join(f"<li>{prose(detail)}</li>" for detail in details)
     listing = f"<ul>{items}</ul>" if items else ""
     said = f"{reason[:1].upper()}{reason[1:]}{'' if reason.endswith('.') else '.'}"
-    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(said)}{listing}</div>'
+    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {prose(said)}{listing}</div>'
 
 
 def judged(judgement: Judgement) -> str:
@@ -292,9 +298,12 @@ def provenance(attributes: Mapping[str, Any]) -> str:
     short: list[tuple[str, str]] = []
     long: list[tuple[str, str]] = []
     for name, value in attributes.items():
-        content = (
-            f"{value:.6g}" if isinstance(value, float) else str(value.decode() if isinstance(value, bytes) else value)
-        )
+        if isinstance(value, float):
+            content = f"{value:.6g}"
+        elif isinstance(value, list):  # of sentences
+            content = " ".join(map(str, value))
+        else:
+            content = str(value.decode() if isinstance(value, bytes) else value)
         (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
     parts = [table(Table("", ("attribute", "value"), short, left=2))] if short else []
     parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]
