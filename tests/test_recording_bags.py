@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read
+from strapdown.recordings import Recording, bag_files, read
 from strapdown.records import Estimate
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
@@ -110,13 +110,17 @@ def test_frames_of_several_names_are_read_in_their_order(bag):
 def test_a_magnetometer_goes_to_the_nearest_stamps(bag, suffix):
     _, content = imu()
     field = np.arange(30.0).reshape(10, 3) * 1e-6
-    content += [("/imu/mag", "MagneticField", START + 20_000_004 * k + 1_000_000, "m", field[k]) for k in range(10)]
+    content += [("/magnet/mag", "MagneticField", START + 20_000_004 * k + 1_000_000, "m", field[k]) for k in range(10)]
     content.append(("/chatter", "String", START, "", "hello"))
     recording = read(bag(suffix, content))
     np.testing.assert_array_equal(recording.magnetic_field[::4], field)
     assert np.isnan(recording.magnetic_field[np.arange(40) % 4 != 0]).all()
     assert recording.magnetic_unit == "T"
-    assert recording.remarks[1] == "Topic /imu/mag: 10 messages."
+    assert recording.remarks[1] == "Topic /magnet/mag: 10 messages."
+    content.append(("/other/mag", "MagneticField", START, "m", field[0]))
+    recording = read(bag(suffix, content, name="two"))
+    assert recording.magnetic_field is None
+    assert "None of /magnet/mag, /other/mag was read, because it is ambiguous which" in recording.remarks[1]
 
 
 def test_of_several_units_one_must_be_chosen(bag):
@@ -222,13 +226,17 @@ def test_a_folder_of_several_bags_is_none(bag, tmp_path):
         read(tmp_path)
 
 
-def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag):
-    values, content = imu(60)
+@pytest.mark.parametrize("first", ["parts", "parts_0"])
+def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag, monkeypatch, first):
+    values, content = imu(80)
     path = bag("folder", content[:20], name="parts")
     (path / "metadata.yaml").unlink()
-    (path / "parts.mcap").rename(path / "parts_0.mcap")
-    for k in (1, 2):
-        (path / f"parts_{k}.mcap").write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    files = [path / f"{name}.mcap" for name in (first, "parts_1", "parts_2", "parts_10")]
+    (path / "parts.mcap").rename(files[0])
+    for k in (1, 2, 3):
+        files[k].write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter([files[1], files[3], files[2], files[0]]))
+    assert bag_files.storages(path) == files
     np.testing.assert_array_equal(read(path).rate, values[:, :3])
 
 
