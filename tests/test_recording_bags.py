@@ -1,5 +1,6 @@
 """ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -195,6 +196,29 @@ def test_a_truncated_bag_gives_what_is_whole_and_says_so(bag, suffix):
         assert f"only its {kept[-1]} complete messages are read" in " ".join(recording.remarks)
     assert 0.4 * 2000 < kept[0] < 0.6 * 2000
     assert 0.8 * 2000 < kept[1] < 2000
+
+
+def test_an_mcap_without_chunks_is_read_and_compared_with_its_index_and_end(bag):
+    values, content = imu()
+    path = bag("mcap", content)
+    magic, data, place, parts = path.read_bytes()[:8], path.read_bytes(), 8, {}
+    while place + 8 < len(data):  # records of kind, size and content
+        kind, size = struct.unpack_from("<BQ", data, place)
+        parts.setdefault(kind, data[place : place + 9 + size])
+        place += 9 + size
+    header, chunk, statistics, footer = (parts[kind] for kind in (0x01, 0x06, 0x0B, 0x02))
+    records = chunk[9 + 28 + 4 + 8 :]  # after the chunk's own fields and the name of no compression
+    more = statistics[:9] + struct.pack("<Q", 41) + statistics[17:]
+    for end, words in (
+        (statistics + footer, ()),
+        (more + footer, ("its index has 41 messages, and 40 are there",)),
+        (statistics, ("it ends without a footer",)),
+    ):
+        path.write_bytes(magic + header + records + end + magic)
+        recording = read(path)
+        np.testing.assert_array_equal(recording.rate, values[:, :3])
+        assert len(recording.remarks) == 1 + len(words)
+        assert all(word in " ".join(recording.remarks) for word in words)
 
 
 def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
