@@ -176,6 +176,25 @@ def test_the_equations_have_the_derivatives_of_their_differences(turned):
         np.testing.assert_allclose(change[rows] / 2e-6, slope, rtol=0.0, atol=1e-5 * np.max(np.abs(slope)))
 
 
+def test_sigma_of_the_field_matrix_is_that_of_its_mean_scale_of_one(turned):
+    """A first-order change, by differences, of the matrix divided by its mean scale, which the fit leaves free."""
+    random = np.random.default_rng(7)
+    root, errors = 1e-2 * random.standard_normal((36, 36)), np.zeros(33)
+    errors[fitting.FIELD] = (0.4 * np.eye(3) + 0.1 * random.standard_normal((3, 3))).ravel()
+    unknowns = fitting.Unknowns(errors, np.eye(3)[None], np.zeros((1, 12)))
+    fit = fitting.Fit(unknowns, root @ root.T, {})
+    unit = calibrating._result(fit, fitting.Prior(errors, errors), 1.0, [turned[1]])
+
+    def scaled(change):
+        A = np.eye(3) + (errors[fitting.FIELD] + change).reshape(3, 3)
+        return 3.0 * A / np.trace(A)
+
+    np.testing.assert_allclose(np.eye(3) + unit.magnetometer_matrix, scaled(0.0), rtol=1e-14)
+    steps = 1e-6 * root[fitting.FIELD].T  # their squares add up to the variance
+    variance = sum(((scaled(step) - scaled(-step)) / 2e-6) ** 2 for step in steps)
+    np.testing.assert_allclose(unit.sigma.magnetometer_matrix, np.sqrt(variance), rtol=1e-6)
+
+
 def test_the_power_of_a_process_at_its_own_frequencies_is_that_of_its_model():
     """A Gauss–Markov process by SciPy's filter; twice as large it has four times the power."""
     interval, time = 0.1, 0.3
