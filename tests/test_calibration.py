@@ -203,7 +203,7 @@ def test_the_power_of_a_process_at_its_own_frequencies_is_that_of_its_model():
     white[1:] *= np.sqrt(1.0 - decay**2)
     nodes = np.zeros((40000, 9))
     nodes[:, fitting.VELOCITY - 3 : fitting.VELOCITY] = 2.0 * scipy.signal.lfilter([1.0], [1.0, -decay], white, axis=0)
-    parts = SimpleNamespace(length=np.full(39999, interval), first=np.array([0, 15000]))
+    parts = SimpleNamespace(length=np.full(39999, interval), first=np.array([0, 14999]))
     problem, unknowns = SimpleNamespace(intervals=parts), fitting.Unknowns(np.zeros(19), np.zeros((40000, 3, 3)), nodes)
     power = fitting._coherence(problem, unknowns, fitting.VELOCITY, time, np.full(40000, 1.0))
     assert power == pytest.approx(4.0, rel=0.06)  # 4 % by what the taper lets leak in

@@ -155,7 +155,7 @@ def test_the_mean_of_two_logs_by_convolution():
 
 @pytest.mark.parametrize(("degrees", "samples"), [(1, 1), (6, 1), (6, 50), (3, 1000)])
 def test_log_mean_bounds_hold_their_tails(degrees, samples):
-    for probability in (0.95, 0.99):
+    for probability in (0.9999, 0.95, 0.99):
         low, high = consistency.log_mean_bounds(degrees, samples, probability)
         assert bounds.log_mean_distribution(low, degrees, samples) == pytest.approx(0.5 * (1 - probability), rel=1e-6)
         assert 1.0 - bounds.log_mean_distribution(high, degrees, samples) == pytest.approx(
