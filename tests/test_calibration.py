@@ -2,15 +2,18 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.signal
+from scipy.spatial.transform import Rotation
 
 import strapdown as sd
 from sims import calibration as study
 from sims import hand_held
 from strapdown import ahrs, calibration, quaternion
-from strapdown.calibration import SensorErrors, UnitCalibration, intervals, with_gyro_states
+from strapdown.calibration import SensorErrors, UnitCalibration, calibrating, fitting, intervals, with_gyro_states
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.recordings import Recording
@@ -114,6 +117,13 @@ def test_missing_motion_is_said():
     assert estimate.sigma.gyro_bias.max() < np.radians(0.05)
     assert "gyro scale x" in str(estimate)
     assert "Rest with" in str(estimate)
+    # of the errors that one motion shows the one that is furthest from good is named, whatever the order
+    several = np.array([[4e-3, 0.0, 0.0], [8e-3, 0.0, 0.0], [6e-3, 0.0, 0.0]])
+    sigma = SensorErrors(gyro_matrix=several, gyro_bias=np.radians([0.1, 0.0, 0.0]), magnetometer_delay=0.006)
+    bias, matrix, delay = calibrating.missing(UnitCalibration(sigma=sigma))
+    assert bias.endswith("σ of gyro bias x is 0.1 °/s, good is 0.05.")
+    assert matrix.endswith("σ of gyro misalignment yx is 0.8 %, good is 0.2.")
+    assert delay.endswith("σ of magnetometer delay is 6 ms, good is 3.")
 
 
 def test_the_prediction_has_the_derivatives_of_its_differences(turned):
@@ -154,6 +164,58 @@ def test_the_prediction_has_the_derivatives_of_its_differences(turned):
         step[k] = 1e-6
         slope = (predicted(x, own + step)[0].force.value - predicted(x, own - step)[0].force.value)[rows] / 2e-6
         np.testing.assert_allclose(slope, base.force.by_own[rows, :, k], atol=3e-5)
+
+
+def test_the_equations_have_the_derivatives_of_their_differences(turned):
+    """Without a lever arm: what its velocity depends on the errors of the gyro is left out."""
+    gathered = intervals.gathered([turned[1]])
+    random = np.random.default_rng(6)
+    nodes = 0.02 * random.standard_normal((len(gathered.time), 12))
+    nodes[:, fitting.LEVER - 3 : fitting.LEVER] = 0.0
+    errors, small = 0.02 * random.standard_normal(33), 0.02 * random.standard_normal((len(nodes), 3))
+    turn = intervals.predicted(gathered, fitting.unpacked(errors), np.zeros((len(gathered.node), 3))).turn
+    attitude = calibrating._gyro_frames(gathered, turn) @ Rotation.from_rotvec(small).as_matrix()
+    x = fitting.Unknowns(errors, attitude, nodes)
+    problem = fitting.Problem(gathered, fitting.Prior(np.zeros(33), np.ones(33)), 9.81)
+    equations = problem.equations(x)
+    step = random.standard_normal(equations.columns)
+    change = problem.equations(x.moved(1e-6 * step)).residual - problem.equations(x.moved(-1e-6 * step)).residual
+    for rows in equations.kinds.values():
+        slope = (equations.jacobian @ step)[rows]
+        np.testing.assert_allclose(change[rows] / 2e-6, slope, rtol=0.0, atol=1e-5 * np.max(np.abs(slope)))
+
+
+def test_sigma_of_the_field_matrix_is_that_of_its_mean_scale_of_one(turned):
+    """A first-order change, by differences, of the matrix divided by its mean scale, which the fit leaves free."""
+    random = np.random.default_rng(7)
+    root, errors = 1e-2 * random.standard_normal((36, 36)), np.zeros(33)
+    errors[fitting.FIELD] = (0.4 * np.eye(3) + 0.1 * random.standard_normal((3, 3))).ravel()
+    unknowns = fitting.Unknowns(errors, np.eye(3)[None], np.zeros((1, 12)))
+    fit = fitting.Fit(unknowns, root @ root.T, {})
+    unit = calibrating._result(fit, fitting.Prior(errors, errors), 1.0, [turned[1]])
+
+    def scaled(change):
+        A = np.eye(3) + (errors[fitting.FIELD] + change).reshape(3, 3)
+        return 3.0 * A / np.trace(A)
+
+    np.testing.assert_allclose(np.eye(3) + unit.magnetometer_matrix, scaled(0.0), rtol=1e-14)
+    steps = 1e-6 * root[fitting.FIELD].T  # their squares add up to the variance
+    variance = sum(((scaled(step) - scaled(-step)) / 2e-6) ** 2 for step in steps)
+    np.testing.assert_allclose(unit.sigma.magnetometer_matrix, np.sqrt(variance), rtol=1e-6)
+
+
+def test_the_power_of_a_process_at_its_own_frequencies_is_that_of_its_model():
+    """A Gauss–Markov process by SciPy's filter; twice as large it has four times the power."""
+    interval, time = 0.1, 0.3
+    decay = np.exp(-interval / time)
+    white = np.random.default_rng(2).standard_normal((40000, 3))
+    white[1:] *= np.sqrt(1.0 - decay**2)
+    nodes = np.zeros((40000, 9))
+    nodes[:, fitting.VELOCITY - 3 : fitting.VELOCITY] = 2.0 * scipy.signal.lfilter([1.0], [1.0, -decay], white, axis=0)
+    parts = SimpleNamespace(length=np.full(39999, interval), first=np.array([0, 14999]))
+    problem, unknowns = SimpleNamespace(intervals=parts), fitting.Unknowns(np.zeros(19), np.zeros((40000, 3, 3)), nodes)
+    power = fitting._coherence(problem, unknowns, fitting.VELOCITY, time, np.full(40000, 1.0))
+    assert power == pytest.approx(4.0, rel=0.06)  # 4 % by what the taper lets leak in
 
 
 @pytest.mark.parametrize(

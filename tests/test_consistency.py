@@ -116,6 +116,10 @@ def test_p_value_and_bounds_agree():
                 assert consistency.mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-6)
     assert consistency.mean_p_value(math.inf, 6, 10) == 0.0
     assert consistency.mean_p_value(math.nan, 6, 10) == 0.0
+    several = {"degrees": 6, "runs": 50, "probability": 0.99}
+    low, high = Verdict(mean=np.ones(4), **several).simultaneous_bounds
+    for mean, p in (([1.0, low, 1.0, 1.0], 0.01), ([1.0, 1.0, 1.0, high], 0.01), ([1.0, 1.01, 1.0, 1.0], 1.0)):
+        assert Verdict(mean=np.array(mean), **several).p_value == pytest.approx(p, rel=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 6])
@@ -151,7 +155,7 @@ def test_the_mean_of_two_logs_by_convolution():
 
 @pytest.mark.parametrize(("degrees", "samples"), [(1, 1), (6, 1), (6, 50), (3, 1000)])
 def test_log_mean_bounds_hold_their_tails(degrees, samples):
-    for probability in (0.95, 0.99):
+    for probability in (0.9999, 0.95, 0.99):
         low, high = consistency.log_mean_bounds(degrees, samples, probability)
         assert bounds.log_mean_distribution(low, degrees, samples) == pytest.approx(0.5 * (1 - probability), rel=1e-6)
         assert 1.0 - bounds.log_mean_distribution(high, degrees, samples) == pytest.approx(
@@ -236,6 +240,11 @@ def test_mean_innovation_is_hotellings():
     mean, p = consistency.mean_innovation_p_value(z)
     assert mean[0] == pytest.approx(z.mean())
     assert p == pytest.approx(scipy.stats.ttest_1samp(z[:, 0], 0.0).pvalue)  # T² of one component is t²
+    few = np.array([[0.1], [0.3], [-0.1]])
+    p_value = scipy.stats.ttest_1samp(few[:, 0], 0.0).pvalue
+    assert consistency.mean_innovation_p_value(few)[1] == pytest.approx(p_value)
+    with pytest.raises(InputError, match="2 samples are too few to judge a mean of 1 components"):
+        consistency.mean_innovation_p_value(few[:2])
     shifted = np.random.default_rng(15).standard_normal((400, 3)) + np.array([0.0, 0.3, 0.0])
     assert consistency.mean_innovation_p_value(shifted)[1] < 1e-4
 
@@ -250,6 +259,9 @@ def test_cross_correlation_pairs_by_time():
     assert correlation[0, 0] == pytest.approx(
         np.sum(a[:, 0] * b[:, 0]) / math.sqrt(np.sum(a[:, 0] ** 2) * np.sum(b**2))
     )
+    # The squared canonical correlation with one component is R² of its regression; p + q + 1 = 4.
+    left = float(np.linalg.lstsq(a, b, rcond=None)[1][0]) / float(np.sum(b**2))
+    assert p == pytest.approx(scipy.stats.chi2.sf(-(300.0 - 2.0) * math.log(left), 2), rel=1e-9)
     shared = b + 0.5 * a[:, :1]
     assert consistency.cross_correlation_p_value(time, a, time + 0.25, shared)[2] < 1e-6  # later, but before the next
     assert consistency.cross_correlation_p_value(time, a, time - 0.25, shared)[2] > 0.01  # the next one's neighbour

@@ -81,6 +81,13 @@ def test_any_two_can_be_compared_and_hashed():
             assert not equal or hash(instance) == hash(other), kind
 
 
+def test_what_a_package_offers_cannot_be_changed():
+    for kind in dataclasses_of_the_package():
+        package = importlib.import_module(kind.__module__.rpartition(".")[0])
+        if getattr(package, kind.__name__, None) is kind:
+            assert kind.__dataclass_params__.frozen, kind
+
+
 def test_specifications_are_compared_by_value():
     """They are written to files and read back, so two of the same numbers are the same."""
 

@@ -413,6 +413,16 @@ def test_conventions_of_quaternions_are_found(run, convention):
     assert any(wanted[convention] in words for words in outcome.remarks)
 
 
+def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():
+    time = 1e3 * np.arange(200.0)
+    truth = FLIGHT.motion.attitude(np.linspace(0.0, 100.0, 200))
+    for seed in (0, 6, 11):
+        fixed, body = quaternion.normalize(np.random.default_rng(seed).standard_normal((2, 4)))
+        own = quaternion.multiply(fixed, quaternion.multiply(truth, body))
+        found = alignment.fit(alignment.Series(time, own), alignment.Series(time, truth), ("fixed", "body"), 0.0)
+        assert found.residual < 1e-9
+
+
 def test_sigma_of_the_alignment_is_honest():
     """White errors of 1° an axis, 60 draws of seven parameters: their squares over their covariance are χ² of seven degrees."""
     time = np.arange(0.0, 60.0, 0.2)
@@ -683,6 +693,8 @@ def test_a_definition_of_the_covariance_that_thousands_of_errors_show_is_certain
     probability = foreign.frame_probabilities(error, readings)
     assert probability["body"] == 1.0
     assert 0.0 < probability["fixed"] < 1e-300
+    readings["euler"] = np.zeros((5000, 3, 3))  # as at a pitch of 90°
+    assert foreign.frame_probabilities(error, readings)["euler"] < 1e-300
 
 
 def test_an_alignment_is_described_with_its_sigma():
@@ -698,6 +710,10 @@ def test_an_alignment_is_described_with_its_sigma():
 def test_times_without_anything_in_common_are_refused(run):
     with pytest.raises(InputError, match="fewer than two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
+    own = alignment.Series(np.arange(10.0), np.tile([1.0, 0.0, 0.0, 0.0], (10, 1)))
+    words = "goes from 5 to 14 s of the truth's clock, and the truth from 20 to 29 s"
+    with pytest.raises(InputError, match=words):
+        alignment.at_common_times(own, alignment.Series(own.time + 20.0, own.attitude), 5.0)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])

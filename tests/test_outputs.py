@@ -142,7 +142,7 @@ def test_a_table_says_all_in_its_names(case):
     np.testing.assert_allclose(
         table["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
     )
-    for name, place in (("xy_rad2", (0, 1)), ("xby_rad2_per_s", (0, 4)), ("bxby_rad2_per_s2", (3, 4))):
+    for name, place in (("xz_rad2", (0, 2)), ("xby_rad2_per_s", (0, 4)), ("bxby_rad2_per_s2", (3, 4))):
         np.testing.assert_array_equal(table[f"cov_body_{name}"], estimate.covariance[:, *place])
     ned = estimate.table(recording=recording, frame="NED", sequence="ZXZ")
     np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], table["free_acceleration_y_m_per_s2"], rtol=1e-15)

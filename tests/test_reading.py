@@ -166,6 +166,8 @@ def test_the_limit_is_on_what_is_unpacked_and_a_user_can_raise_it(tmp_path, monk
         InputError, match=r"zeros\.h5 has 1\.92 MB, more than the maximum of 1 MB.*STRAPDOWN_MAX_MB \(1 now\)"
     ):
         recordfiles.read_record(path)
+    (tmp_path / "full").write_bytes(bytes(1_000_000))
+    assert len(reading.content(tmp_path / "full")) == 1_000_000
     monkeypatch.setenv("STRAPDOWN_MAX_MB", "2")
     assert len(recordfiles.read_record(path).increments) == 60_000
     monkeypatch.setenv("STRAPDOWN_MAX_MB", "much")

@@ -1,5 +1,6 @@
 """ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read
+from strapdown.recordings import Recording, bag_files, read
 from strapdown.records import Estimate
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
@@ -110,13 +111,17 @@ def test_frames_of_several_names_are_read_in_their_order(bag):
 def test_a_magnetometer_goes_to_the_nearest_stamps(bag, suffix):
     _, content = imu()
     field = np.arange(30.0).reshape(10, 3) * 1e-6
-    content += [("/imu/mag", "MagneticField", START + 20_000_004 * k + 1_000_000, "m", field[k]) for k in range(10)]
+    content += [("/magnet/mag", "MagneticField", START + 20_000_004 * k + 1_000_000, "m", field[k]) for k in range(10)]
     content.append(("/chatter", "String", START, "", "hello"))
     recording = read(bag(suffix, content))
     np.testing.assert_array_equal(recording.magnetic_field[::4], field)
     assert np.isnan(recording.magnetic_field[np.arange(40) % 4 != 0]).all()
     assert recording.magnetic_unit == "T"
-    assert recording.remarks[1] == "Topic /imu/mag: 10 messages."
+    assert recording.remarks[1] == "Topic /magnet/mag: 10 messages."
+    content.append(("/other/mag", "MagneticField", START, "m", field[0]))
+    recording = read(bag(suffix, content, name="two"))
+    assert recording.magnetic_field is None
+    assert "None of /magnet/mag, /other/mag was read, because it is ambiguous which" in recording.remarks[1]
 
 
 def test_of_several_units_one_must_be_chosen(bag):
@@ -193,6 +198,29 @@ def test_a_truncated_bag_gives_what_is_whole_and_says_so(bag, suffix):
     assert 0.8 * 2000 < kept[1] < 2000
 
 
+def test_an_mcap_without_chunks_is_read_and_compared_with_its_index_and_end(bag):
+    values, content = imu()
+    path = bag("mcap", content)
+    magic, data, place, parts = path.read_bytes()[:8], path.read_bytes(), 8, {}
+    while place + 8 < len(data):  # records of kind, size and content
+        kind, size = struct.unpack_from("<BQ", data, place)
+        parts.setdefault(kind, data[place : place + 9 + size])
+        place += 9 + size
+    header, chunk, statistics, footer = (parts[kind] for kind in (0x01, 0x06, 0x0B, 0x02))
+    records = chunk[9 + 28 + 4 + 8 :]  # after the chunk's own fields and the name of no compression
+    more = statistics[:9] + struct.pack("<Q", 41) + statistics[17:]
+    for end, words in (
+        (statistics + footer, ()),
+        (more + footer, ("its index has 41 messages, and 40 are there",)),
+        (statistics, ("it ends without a footer",)),
+    ):
+        path.write_bytes(magic + header + records + end + magic)
+        recording = read(path)
+        np.testing.assert_array_equal(recording.rate, values[:, :3])
+        assert len(recording.remarks) == 1 + len(words)
+        assert all(word in " ".join(recording.remarks) for word in words)
+
+
 def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
     values, content = imu()
     path = bag("folder", content)
@@ -222,13 +250,17 @@ def test_a_folder_of_several_bags_is_none(bag, tmp_path):
         read(tmp_path)
 
 
-def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag):
-    values, content = imu(60)
+@pytest.mark.parametrize("first", ["parts", "parts_0"])
+def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag, monkeypatch, first):
+    values, content = imu(80)
     path = bag("folder", content[:20], name="parts")
     (path / "metadata.yaml").unlink()
-    (path / "parts.mcap").rename(path / "parts_0.mcap")
-    for k in (1, 2):
-        (path / f"parts_{k}.mcap").write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    files = [path / f"{name}.mcap" for name in (first, "parts_1", "parts_2", "parts_10")]
+    (path / "parts.mcap").rename(files[0])
+    for k in (1, 2, 3):
+        files[k].write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter([files[1], files[3], files[2], files[0]]))
+    assert bag_files.storages(path) == files
     np.testing.assert_array_equal(read(path).rate, values[:, :3])
 
 
@@ -320,8 +352,10 @@ def test_what_a_bag_cannot_hold_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not declare the unit of its magnetometer, which is needed in T"):
         recordings.write(replace(tesla(), magnetic_unit=""), tmp_path / "x.bag")
     with pytest.raises(InputError, match="no negative times"):
-        recordings.write(replace(tesla(epoch=0), time=np.arange(60.0) - 5.0), tmp_path / "x.bag")
+        recordings.write(replace(tesla(epoch=0), time=np.arange(60.0) - 0.5), tmp_path / "x.bag")
     assert not list(tmp_path.iterdir())
+    recordings.write(replace(tesla(epoch=0), time=np.arange(60.0)), tmp_path / "x.bag")
+    assert read(tmp_path / "x.bag").clock_ns[0] == 0
 
 
 def test_commands_read_bags_and_say_the_topic(bag, tmp_path):

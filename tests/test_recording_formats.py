@@ -344,6 +344,9 @@ def test_a_folder_of_euroc_is_read_with_its_truth_between_its_stamps(tmp_path, t
     reference = read_attitudes(folder)
     assert reference.stamps_ns.tolist() == stamps[known].tolist()
     np.testing.assert_array_equal(reference.attitude, recording.true_attitude[known])
+    (folder / "mav0" / truth / "data.csv").write_text("#timestamp, p_x, p_y\n1,2.0,3.0\n2,2.0,3.0\n")
+    with pytest.raises(InputError, match="has 3 columns; wanted time, position and quaternion"):
+        read(folder)
 
 
 def test_a_trajectory_is_a_reference(tmp_path):

@@ -13,6 +13,7 @@ from strapdown import coning, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation.setup import read_estimate, write_estimate
 from strapdown.files import reading
+from strapdown.recordings import Recording
 from strapdown.records import Estimate, ImuRecord, Truth, compress, cut
 from strapdown.vectors import VectorMeasurements
 
@@ -348,6 +349,15 @@ def test_the_listing_of_a_record_has_the_rate_of_each_series():
     gyro, vectors = record.listing().cells
     assert [gyro[0], *gyro[2:]] == ["gyro", "200", "100"]
     assert [vectors[0], *vectors[2:]] == ["star", "2", "1"]
+
+
+def test_the_listing_of_a_recording_has_its_rate_and_the_size_of_its_samples():
+    rate = np.radians([[3.0, 0.0, 4.0]] * 10 + [[0.0, 60.0, 0.0]])
+    force = np.full((11, 3), np.nan)
+    force[::5] = [[0.0, 0.0, 9.0], [0.0, 0.0, 9.5], [0.0, 0.0, 10.0]]
+    listing = Recording(source="box", time=0.1 * np.arange(11.0), rate=rate, specific_force=force).listing()
+    assert listing.title == "box: 11 samples over 1 s, 10 Hz"
+    assert listing.cells == [["gyro", "°/s", "11", "5", "60"], ["accelerometer", "m/s²", "3", "9.5", "10"]]
 
 
 def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():

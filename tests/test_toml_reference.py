@@ -2,6 +2,7 @@
 
 import copy
 import importlib.util
+import math
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 from strapdown import scenarios
 from strapdown.checks import InputError
 from strapdown.cli import app
+from strapdown.files import tables
 from strapdown.scenarios import keys
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -93,6 +95,19 @@ def test_every_accepted_key_is_in_the_reference(section):
         refusal = _refusal(section, "no_such_key", 1.0, preset="stim300")
     accepted = set(re.search(r"\(known: (.*)\)", refusal)[1].split(", "))
     assert accepted - TABLES == {name for key in section.keys for name in (key.name, *key.others)}
+
+
+DEGREE, ARCSECOND = math.pi / 180.0, math.pi / 648_000.0
+SI = {"deg": DEGREE, "arcsec": ARCSECOND, "mrad": 1e-3, "deg_per_s": DEGREE, "deg_per_hour": ARCSECOND, "ppm": 1e-6}
+SI |= {"nt": 1e-9} | dict.fromkeys(("ratio", "s", "hz", "m", "degc", "rad", "rad_per_s", "m_per_s2", "t"), 1.0)
+
+
+def test_every_unit_of_a_key_is_converted_to_si():
+    choices = [choice for name, choice in vars(tables).items() if name.isupper() and isinstance(choice, tuple)]
+    factors = [(suffix, factor) for choice in choices for suffix, factor in choice if suffix]
+    assert {suffix for suffix, _ in factors} == set(SI)
+    for suffix, factor in factors:
+        assert factor == pytest.approx(SI[suffix], rel=1e-15), suffix
 
 
 def test_every_section_and_key_is_printed():

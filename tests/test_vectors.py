@@ -278,6 +278,8 @@ def test_one_sigma_of_an_attitude_is_that_about_each_axis():
     varying = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": each})
     np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
     np.testing.assert_allclose(varying.noise_scaled(3.0).sigma_axes[:, 1], 3.0 * each, rtol=1e-15)
+    whole = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.0, "covariance": np.diag([1e-4, 4e-4, 9e-4])})
+    np.testing.assert_allclose(whole.noise_scaled(3.0).covariance, 9.0 * whole.covariance, rtol=1e-15)
     empty = {"time": [], "attitude": np.empty((0, 4))}
     assert vectors.VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
 

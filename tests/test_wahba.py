@@ -294,6 +294,10 @@ REFUSED = {
         ([EYE[0], EYE[1], EYE[2]], [EYE[0], EYE[1], EYE[2] + 0.1 * EYE[1]], 1e-3),
         r"directions 1 and 2 are 90° apart in the body frame but 84.2894° in the fixed frame.*0.486",
     ),
+    "inconsistent beyond rounding": (
+        ([EYE[0], EYE[1], EYE[2]], [EYE[0], EYE[1], EYE[2] + 1e-12 * EYE[1]], 1e-17),
+        "directions 1 and 2 are 90° apart",
+    ),
     "swapped": ((EYE[[1, 0, 2]] + 0.3, SKEWED, 1e-3), "mixed-up pair"),
     "zero body": (([EYE[0], 0.0 * EYE[1]], EYE[:2], 1e-3), r"vectors_b\[1\] is the zero vector"),
     "zero reference": ((EYE[:2], [0.0 * EYE[0], EYE[1]], 1e-3), r"references_f\[0\] is the zero vector"),

@@ -59,8 +59,7 @@ def encode(value: Any, form: Form) -> dict[str, Any]:
         content, default = getattr(value, field.name), field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        known = default is not dataclasses.MISSING and default is not None
-        if field.name in form and content is not None and not (known and _same(content, default)):
+        if field.name in form and content is not None and not _same(content, default):
             table.update(_entry(field.name, content, form[field.name]))
     return table
 

@@ -45,10 +45,8 @@ def storages(path: Path) -> list[Path]:
     """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
     name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
     endings = "|".join(map(re.escape, _ENDINGS))
-    numbers = {file: re.fullmatch(rf"{name}(?:_(\d{{1,9}}))?({endings})", file.name) for file in path.iterdir()}
-    return sorted(
-        (file for file, number in numbers.items() if number), key=lambda file: int((numbers[file] or [0, 0])[1] or 0)
-    )
+    files = [file for file in path.iterdir() if re.fullmatch(rf"{name}(_\d{{1,9}})?({endings})", file.name)]
+    return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 is after 9
 
 
 class Bag:
