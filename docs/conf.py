@@ -109,10 +109,10 @@ class _OneTemplate(SandboxedEnvironment):
 
     _read: ClassVar[dict[str, Template]] = {}
 
-    def get_template(self, name: Any, *given: Any, **options: Any) -> Template:
+    def get_template(self, name: Any, *arguments: Any, **options: Any) -> Template:
         """Return a template, compiled once."""
         if name not in self._read:
-            self._read[name] = super().get_template(name, *given, **options)
+            self._read[name] = super().get_template(name, *arguments, **options)
         return self._read[name]
 
 

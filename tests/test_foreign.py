@@ -419,8 +419,8 @@ def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():
     for seed in (0, 6, 11):
         fixed, body = quaternion.normalize(np.random.default_rng(seed).standard_normal((2, 4)))
         own = quaternion.multiply(fixed, quaternion.multiply(truth, body))
-        found = alignment.fit(alignment.Series(time, own), alignment.Series(time, truth), ("fixed", "body"), 0.0)
-        assert found.residual < 1e-9
+        fitted = alignment.fit(alignment.Series(time, own), alignment.Series(time, truth), ("fixed", "body"), 0.0)
+        assert fitted.residual < 1e-9
 
 
 def test_sigma_of_the_alignment_is_honest():
