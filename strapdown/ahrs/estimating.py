@@ -164,8 +164,7 @@ def estimate(
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, at_rest, options)
-    scales = regions.scales(filtered, parameters, max(parameters.step, used.interval), causal=not smooth)
-    at_stamps = _at_stamps(filtered, scales, used, prepared, parameters, delays, options)
+    at_stamps = _at_stamps(filtered, used, prepared, parameters, delays, options)
     return AhrsEstimate(
         recording=used,
         estimate=at_stamps,
@@ -255,7 +254,6 @@ def uncertain_turns(variance: Array) -> Array:
 
 def _at_stamps(
     filtered: Estimate,
-    scales: tuple[Array, Array],
     used: Recording,
     prepared: Prepared,
     parameters: AhrsParameters,
@@ -269,6 +267,7 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
+    scales = regions.scales(filtered, parameters, interval, causal=not options.smooth)
     level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))

@@ -116,7 +116,7 @@ def first_vector(samples: Array | None, turned: Array, source: str, sensor: str)
             f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
         )
     k = int(np.argmax(valid))
-    return samples[0] if k == 0 else np.asarray(quaternion.rotate(turned[k], samples[k]))
+    return np.asarray(quaternion.rotate(turned[k], samples[k]))
 
 
 def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> estimation.State:
