@@ -262,6 +262,10 @@ def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag, monkeypatc
     monkeypatch.setattr(Path, "iterdir", lambda folder: iter([files[1], files[3], files[2], files[0]]))
     assert bag_files.storages(path) == files
     np.testing.assert_array_equal(read(path).rate, values[:, :3])
+    # Of a recorder that was killed before it had compressed the last part.
+    compressed = [path / name for name in ("parts_0.mcap.zstd", "parts_1.mcap.zstd", "parts_2.mcap")]
+    monkeypatch.setattr(Path, "iterdir", lambda folder: iter(compressed[::-1]))
+    assert bag_files.storages(path) == compressed
 
 
 def test_content_decides_not_the_ending(bag, tmp_path):

@@ -45,8 +45,12 @@ def storages(path: Path) -> list[Path]:
     """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
     name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
     endings = "|".join(map(re.escape, _ENDINGS))
-    files = [file for file in path.iterdir() if re.fullmatch(rf"{name}(_\d{{1,9}})?({endings})", file.name)]
-    return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 is after 9
+    numbers = {}
+    for file in path.iterdir():
+        match = re.fullmatch(rf"{name}(?:_(\d{{1,9}}))?({endings})", file.name)
+        if match:
+            numbers[file] = int(match[1] or 0)
+    return sorted(numbers, key=lambda file: numbers[file])
 
 
 class Bag:
