@@ -119,7 +119,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
             bank = multiple_model.run(
                 record, noise, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
             )
-            estimate, rows = bank.estimate, bank.edges
+            estimate, rows = bank.estimate, np.searchsorted(record.time, bank.estimate.time)
             became_one.append(bank.became_one)
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)

@@ -31,7 +31,6 @@ from strapdown.kernels import (
     analysis,
     complementary,
     gate,
-    hypotheses,
     likelihood,
     likelihood_outliers,
     machine,
@@ -224,7 +223,6 @@ BODIES = [
     (montecarlo_run, montecarlo_six),
     (likelihood, OWN),
     (likelihood_outliers, likelihood, OWN),
-    (hypotheses, FILTER),
     (complementary, FILTER),
 ]
 """What the walk is compiled with."""
@@ -250,7 +248,6 @@ def test_every_body_of_the_walk_is_listed_here():
         ("montecarlo_run", "*prepared.parts"),
         ("kernels",),
         ("*bodies",),
-        ("kernel", "kernels"),
         ("complementary", "kernels"),
     }
 

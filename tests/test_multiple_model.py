@@ -5,21 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 from measured import assert_inside, errors, in_body, resting, series_of, turn_to, unit
-from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from strapdown import consistency, estimation, quaternion, records, scenarios
 from strapdown.estimation import forward, multiple_model
-from strapdown.estimation.forward import gate_options
-from strapdown.estimation.gating import Gate
-from strapdown.estimation.states import GateMemory, ProcessNoise
-from strapdown.kernels import gate_rules, hypotheses
-from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.walk import walk
+from strapdown.estimation.states import ProcessNoise
 from strapdown.motion import ConstantRate
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements, wahba
 
@@ -50,8 +43,7 @@ def orbit(run, *, duration=1500.0, seed=11, **changes):
 
 
 def judged(bank, record):
-    truth = Truth(attitude=record.truth.attitude[bank.edges], bias=record.truth.bias[bank.edges])
-    e = errors(bank.estimate, truth)
+    e = errors(bank.estimate, record.truth.taken(np.isin(record.time, bank.estimate.time)))
     return e, consistency.nees(e, bank.estimate.covariance)
 
 
@@ -82,184 +74,80 @@ def goes_on(bank, row, record, process, **options):
 
 
 def test_the_hypotheses_lie_evenly_on_the_circle_that_the_first_direction_leaves():
-    record = still(np.array([0.5, 0.5, -0.5, 0.5]), [[0.3, -0.2, 0.9]], 1e-3, np.random.default_rng(1))
-    x, P, angles = multiple_model.start(problem_of(record, QUIET, bias_sigma=1e-4), 0, 24)
-    z, r = record.vectors[0].vector_b[0], record.vectors[0].reference_f
-    q, P = x[:, :4], P[5]
-    assert np.allclose(quaternion.rotate(q, np.broadcast_to(z, (24, 3))), r, atol=1e-14)
-    turn = quaternion.multiply(quaternion.conjugate(q), np.roll(q, -1, axis=0))
-    assert np.allclose(quaternion.angle_between(q, np.roll(q, -1, axis=0)), 2.0 * np.pi / 24, atol=1e-12)
-    assert np.allclose(np.abs(quaternion.log(turn) @ z), 2.0 * np.pi / 24, atol=1e-12)
-    assert np.allclose(np.diff(angles), 2.0 * np.pi / 24)
-    assert z @ P[:3, :3] @ z == pytest.approx((np.pi / 24) ** 2)
-    assert np.allclose(np.linalg.eigvalsh(P[:3, :3])[:2], 1e-6)
-    assert np.allclose(P[3:, 3:], 1e-8 * np.eye(3))
-
-
-def test_the_tilt_of_the_hypotheses_has_the_noise_of_the_first_direction():
-    """An error n of the direction z shows as a rotation z × n."""
+    """The tilt has the noise of the direction: an error n of the direction z shows as a rotation z × n."""
     record = still(np.array([0.5, 0.5, -0.5, 0.5]), [[0.3, -0.2, 0.9]], 1e-3, np.random.default_rng(1))
     C = np.array([[1.0, 0.2, 0.1], [0.2, 2.0, 0.4], [0.1, 0.4, 3.0]]) * 1e-6
     series = dataclasses.replace(record.vectors[0], sigma=np.zeros(20), covariance=C)
-    problem = problem_of(dataclasses.replace(record, vectors=(series,)), QUIET)
-    _, P, _ = multiple_model.start(problem, 0, 24)
-    z = series.vector_b[0]
+    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=1e-4)
+    events = forward.prepared(dataclasses.replace(record, vectors=(series,)), QUIET, initial, ()).events
+    states = multiple_model.start(events, 0, initial, 24)
+    z, r, q = series.vector_b[0], series.reference_f, np.array([state.attitude for state in states])
+    assert np.allclose(quaternion.rotate(q, np.broadcast_to(z, (24, 3))), r, atol=1e-14)
+    turn = turn_to(q, np.roll(q, -1, axis=0))
+    assert np.allclose(np.abs(turn @ z), 2.0 * np.pi / 24, atol=1e-12)
+    assert np.allclose(np.linalg.norm(turn, axis=1), 2.0 * np.pi / 24, atol=1e-12)
+    P = states[3].covariance
+    assert z @ P[:3, :3] @ z == pytest.approx((np.pi / 24) ** 2)
     for axis in np.eye(3):
         t = unit(np.cross(axis, z))
         arm = np.cross(t, z)
-        assert t @ P[3, :3, :3] @ t == pytest.approx(arm @ C @ arm, rel=1e-9)
+        assert t @ P[:3, :3] @ t == pytest.approx(arm @ C @ arm, rel=1e-9)
+    assert np.allclose(P[3:, 3:], 1e-8 * np.eye(3))
+    assert not P[:3, 3:].any()
 
 
-# ----------------------------------------------------------------------------------------------------------------- the kernels
+# ----------------------------------------------------------------------------------------------------------------- the mixture
 
 
 @pytest.mark.parametrize("decades", [0.0, 3.0, 6.0])
-def test_share_between_is_a_trace(decades):
+def test_the_share_of_differences_is_a_trace(decades):
     random = np.random.default_rng(3)
-    for _ in range(20):
-        axes = Rotation.random(rng=random).as_matrix()
-        T = axes @ np.diag(10.0 ** np.array([0.0, -decades, -decades])) ** 2 @ axes.T
-        d = np.linalg.cholesky(T) @ random.standard_normal(3)
-        share = hypotheses.share_between(T, np.outer(d, d), 0)
-        assert share == pytest.approx(d @ np.linalg.solve(T, d), rel=10.0 ** (2.0 * decades - 14.0) + 1e-10)
+    axes = Rotation.random(20, rng=random).as_matrix()
+    T = axes @ np.diag(10.0 ** np.array([0.0, -decades, -decades])) ** 2 @ np.swapaxes(axes, 1, 2)
+    z = random.standard_normal((20, 3))
+    d = (np.linalg.cholesky(T) @ z[..., None])[..., 0]
+    shares = multiple_model.share(T, np.einsum("ki,kj->kij", d, d), slice(3))
+    np.testing.assert_allclose(shares, np.sum(z * z, axis=1), rtol=10.0 ** (2.0 * decades - 14.0) + 1e-10)
 
 
-def mixture(random, members, spread):
-    """Random states near a random attitude, packed, and their weights."""
-    centre = quaternion.normalize(random.standard_normal(4))
-    states, weights = [], random.random(members)
-    for _ in range(members):
-        q = quaternion.multiply(centre, quaternion.exp(spread * random.standard_normal(3)))
-        root = np.diag([1e-2] * 3 + [1e-5] * 3) @ random.standard_normal((6, 6))
-        states.append((np.concatenate([q, 1e-5 * random.standard_normal(3)]), root @ root.T))
-    x, P = map(np.array, zip(*states, strict=True))
-    return x, P, weights / weights.sum()
-
-
-def problem_of(record, process, *, bias_sigma=1e-5):
-    """The record as the bank prepares it."""
-    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma)
-    return forward.prepared(record, process, initial, ())
-
-
-def matched(x, P, weights):
-    """Mean, covariance, and covariance between the members of a mixture, by the kernel."""
-    record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[1.0, 0.0, 0.0]], 1e-3, np.random.default_rng(0))
-    form = multiple_model.filter_form(problem_of(record, QUIET), x, P)
-    out = np.empty(7), np.empty((6, 6)), np.empty((6, 6))
-    plain(hypotheses.moment_match, forward.instance_of(forward.ANY_SENSOR))(form, weights, *out)
-    return out
-
-
-def test_moment_matching_has_the_moments_of_draws_from_the_mixture():
+def test_moments_are_those_of_draws_from_the_mixture():
     random = np.random.default_rng(5)
-    x, P, weights = mixture(random, 5, 0.05)
-    mean, total, between = matched(x, P, weights)
+    centre = quaternion.normalize(random.standard_normal(4))
+    q = quaternion.multiply(centre, quaternion.exp(0.05 * random.standard_normal((5, 3))))
+    bias, weights = 1e-5 * random.standard_normal((5, 3)), random.random(5)
+    root = np.diag([1e-2] * 3 + [1e-5] * 3) @ random.standard_normal((5, 6, 6))
+    weights /= weights.sum()
+    P = root @ np.swapaxes(root, 1, 2)
+    members = [Estimate.from_arrays([0.0], [q[i]], [P[i]], bias=[bias[i]]) for i in range(5)]
+    (mean,), (mean_bias,), total, between = multiple_model.mixture(members, np.array([0]), weights[:, None])
     number = 400_000
     which = random.choice(5, number, p=weights)
     drawn = np.einsum("nij,nj->ni", np.linalg.cholesky(P)[which], random.standard_normal((number, 6)))
-    q = quaternion.multiply(x[which, :4], quaternion.exp(drawn[:, :3]))
-    e = consistency.errors(mean[:4], mean[4:], q, x[which, 4:] + drawn[:, 3:])
-    sigma = np.sqrt(np.diag(total))
+    attitude = quaternion.multiply(q[which], quaternion.exp(drawn[:, :3]))
+    e = consistency.errors(mean, mean_bias, attitude, bias[which] + drawn[:, 3:])
+    sigma = np.sqrt(np.diag(total[0]))
     assert np.abs(e.mean(axis=0) / sigma).max() < 4.0 / np.sqrt(number) + 1e-3  # the mean attitude's own second order
-    assert np.abs((e.T @ e / number - total) / np.outer(sigma, sigma)).max() < 0.01
+    assert np.abs((e.T @ e / number - total[0]) / np.outer(sigma, sigma)).max() < 0.01
     inside = np.einsum("n,nij->ij", weights, P)
-    for k, block in enumerate((slice(0, 3), slice(3, 6))):
-        share = np.trace(np.linalg.solve(total[block, block], (total - inside)[block, block]))
-        assert hypotheses.share_between(total, between, 3 * k) == pytest.approx(share, rel=0.02)
+    assert np.abs((total - between - inside) / np.outer(sigma, sigma)).max() < 0.02
+    alone = multiple_model.mixture([members[0]] * 4, np.array([0]), np.full((4, 1), 0.25))
+    for moment, wanted in zip(alone, (q[0], bias[0], P[0], np.zeros((6, 6))), strict=True):
+        np.testing.assert_allclose(moment[0], wanted, rtol=1e-12, atol=1e-16)
 
 
-def test_moment_matching_of_equal_members_is_the_member():
-    x, P, _ = mixture(np.random.default_rng(6), 1, 0.0)
-    mean, total, between = matched(np.repeat(x, 4, axis=0), np.repeat(P, 4, axis=0), np.full(4, 0.25))
-    assert np.allclose(mean, x[0], rtol=1e-12, atol=1e-16)
-    assert np.allclose(total, P[0], rtol=1e-12, atol=1e-16)
-    assert np.abs(between).max() < 1e-20
-
-
-def kernel_run(walked, record, process, x, P):
-    """Run equally likely hypotheses that are never one over a record by the walk itself; return its outputs and what it says."""
-    rows, number = len(record.time), len(x)
-    problem = problem_of(record, process)
-    measured = forward.measurements_in_body_axes(problem.events)
-    shapes = (rows, 7), (rows, 6, 6), (6, 6), (rows, number), (len(measured.time), 6)
-    out = hypotheses.Outputs._make(np.empty(shape) for shape in shapes)
-    body = hypotheses.Body(
-        form=multiple_model.filter_form(problem, x, P),
-        log_weight=np.zeros(number),
-        weight=np.empty(number),
-        options=gate_options(None, None),
-        min_weight=1e-6,
-        max_share=-1.0,  # a share that nothing is below
-        first_row=0,
-    )
-    kernels = forward.instance_of(forward.ANY_SENSOR)
-    walked = walked(walk, hypotheses, kernels)
-    return out, walked(read_only(record.time), read_only(record.increments), measured, 1, body, out)
-
-
-def test_for_small_errors_it_is_the_plain_filter():
-    random = np.random.default_rng(8)
-    record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], 1e-4, random)
-    first, second = record.vectors
-    record = dataclasses.replace(record, vectors=(first, dataclasses.replace(second, sigma=np.full(20, 3e-4))))
-    initial = estimation.initial_state(
-        quaternion.exp(np.array([1e-4, -2e-4, 1e-4])), attitude_sigma=2e-4, bias_sigma=1e-6
-    )
-    without = estimation.run(record, QUIET, initial, full_covariance=True)
-    x = np.tile(np.concatenate([initial.attitude, initial.bias]), (2, 1))
-    # One hypothesis is one at the first edge; a share that nothing is below and a weight that is never alone keep it running.
-    out, done = kernel_run(plain, record, QUIET, x, np.tile(initial.covariance, (2, 1, 1)))
-    assert done == (len(record.time), hypotheses.RUNNING, 40)
-    assert quaternion.angle_between(out.x[:, :4], without.attitude).max() < 1e-8  # 1e-4 of σ: the reset's second order
-    assert np.allclose(out.x[:, 4:], without.bias, rtol=0.0, atol=1e-10)
-    scale = without.sigma[:, :, None] * without.sigma[:, None, :]
-    assert np.abs((out.P - without.covariance) / scale).max() < 1e-3
-    assert np.allclose(out.weights, 0.5)
-
-
-@pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
-def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bias_sigma, monkeypatch):
-    """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
-    time = 0.3 * np.arange(21)
-    stamps = np.concatenate([[0.05, 0.1], time[2:]])
-    # The second attitude is nearly half a turn off: where little is known of the bias, the bias is blamed.
-    attitude = quaternion.exp(np.where(stamps == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
-    series = tracker(stamps, attitude, 1e-2)
-    record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(series,))
-    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3)
-    # One hypothesis, reported at the end of the record.
-    bank = multiple_model.run(record, noise, bias_sigma=bias_sigma, every=20)
-    start = estimation.initial_state(attitude[0], attitude_sigma=1e-2, bias_sigma=bias_sigma)
-    increments = record.increments.copy()
-    increments[0] *= 0.25 / 0.3
-    edges = np.concatenate([stamps[:1], time[1:]])
-    rest = ImuRecord(time=edges, increments=increments, vectors=(series.taken(stamps > stamps[0]),))
-    # A gate that accepts everything, in a filter that relinearises its updates as after a recovery.
-    monkeypatch.setattr(Gate, "thresholds", np.full(3, np.inf))
-    counts = np.zeros(gate_rules.MEMORY)
-    counts[gate_rules.PASSES] = gate_rules.WIDE_PASSES
-    start = dataclasses.replace(start, gate=GateMemory(restart_bias_variance=np.ones(3), counts=counts, counters={}))
-    single = estimation.run(rest, noise, start, full_covariance=True, gate=Gate(recovery=None))
-    assert (np.abs(single.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
-    np.testing.assert_allclose(bank.estimate.innovations["tracker"].nis, single.innovations["tracker"].nis, rtol=1e-7)
-    np.testing.assert_allclose(bank.estimate.bias[-1], single.bias[-1], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(bank.estimate.covariance[-1], single.covariance[-1], rtol=1e-7, atol=1e-15)
-
-
-def test_weights_are_the_densities_of_the_measurement():
-    """Two hypotheses of one attitude, one surer than the other: what counts is N(e; 0, S), its height and not its exponent alone."""
-    random = np.random.default_rng(10)
-    record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[0.0, 0.0, 1.0]], 1e-3, random, seconds=1)
-    prior = [np.diag([s**2, (2.0 * s) ** 2, s**2, 1e-12, 1e-12, 1e-12]) for s in (1e-3, 5e-3)]
-    x = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
-    process = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=0.0)
-    out, _ = kernel_run(compiled, record, process, x, np.array(prior))
-    z = record.vectors[0].vector_b[0]
-    densities = [
-        multivariate_normal.pdf([z[0], z[1]], cov=np.diag([P[1, 1], P[0, 0]]) + 1e-6 * np.eye(2)) for P in prior
-    ]
-    assert np.allclose(out.weights[0], np.array(densities) / np.sum(densities), rtol=1e-4)
+def test_likelihoods_are_the_densities_of_the_measurement():
+    """Of one attitude, one surer than the other: what counts is N(e; 0, S), its height and not its exponent alone."""
+    record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[0.0, 0.0, 1.0]], 1e-3, np.random.default_rng(10), seconds=1)
+    z, densities, likelihoods = record.vectors[0].vector_b[0], [], []
+    for s in (1e-3, 5e-3):
+        P = np.diag([s**2, (2.0 * s) ** 2, s**2, 1e-12, 1e-12, 1e-12])
+        state = estimation.State(attitude=[1.0, 0.0, 0.0, 0.0], bias=np.zeros(3), covariance=P)
+        problem = forward.prepared(record, QUIET, state, ())
+        estimate = forward.filtered(problem, forward.Options()).estimate
+        likelihoods += [np.exp(multiple_model.log_likelihood(problem, estimate, record.time))]
+        densities += [multivariate_normal.pdf(z[:2], cov=np.diag([P[1, 1], P[0, 0]]) + 1e-6 * np.eye(2))]
+    for likelihood in np.transpose(likelihoods):
+        assert np.allclose(likelihood / np.sum(likelihood), np.array(densities) / np.sum(densities), rtol=1e-4)
 
 
 def starts(runs, hypotheses, **options):
@@ -293,8 +181,8 @@ def check_starts(outcomes, epochs):
     assert_inside(total / number, 1, number)
 
 
-def test_from_a_hundred_starts_anywhere_it_finds_the_attitude_and_is_consistent():
-    check_starts(starts(120, multiple_model.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
+def test_from_starts_anywhere_it_finds_the_attitude_and_is_consistent():
+    check_starts(starts(40, multiple_model.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
 
 
 @pytest.mark.slow
@@ -332,10 +220,11 @@ def test_a_constant_reference_leaves_the_turn_about_it_open_and_it_says_so(rate)
     assert "(+0.71, -0.00, +0.71)" in bank.reason or "(+0.71, +0.00, +0.71)" in bank.reason
     assert np.allclose(bank.weights[-1], 1.0 / 24, atol=1e-6)
     widest = np.sqrt(np.linalg.eigvalsh(bank.estimate.covariance[:, :3, :3])[:, -1])
-    assert np.all(widest >= widest[0] * (1.0 - 1e-6))  # nothing is learnt that cannot be known
+    # Nothing is learnt that cannot be known, but for the second order of the tilt.
+    assert np.all(widest >= widest[0] * (1.0 - 1e-3))
     e, _ = judged(bank, record)
-    across = quaternion.rotate(record.truth.attitude[bank.edges], e[:, :3])
-    assert np.linalg.norm(np.cross(across, field / np.linalg.norm(field))[-1]) < 0.02  # all but the turn is known
+    across = quaternion.rotate(record.truth.attitude[-1], e[-1, :3])
+    assert np.linalg.norm(np.cross(across, field / np.linalg.norm(field))) < 0.02  # all but the turn is known
 
 
 def test_a_reference_that_turned_too_little_is_reported():
@@ -368,15 +257,6 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
 
 
 # ---------------------------------------------------------------------------------------------------------------- from one to the next
-
-
-def test_compiled_and_plain_are_the_same(monkeypatch):
-    record, belief = orbit(0, duration=150.0)
-    fast = multiple_model.run(record, belief, hypotheses=8, every=30)
-    monkeypatch.setattr(multiple_model, "compiled", plain)
-    slow = multiple_model.run(record, belief, hypotheses=8, every=30)
-    assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
-    assert np.allclose(fast.weights, slow.weights, atol=1e-7)
 
 
 def test_it_goes_on_as_the_filter_once_it_is_one():
@@ -439,7 +319,7 @@ def test_it_starts_at_the_first_direction_and_counts_what_came_before():
     bank = multiple_model.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
     assert bank.estimate.skipped == {"magnetometer": 3, "compass": 2}
     assert bank.estimate.time[0] == 42.0  # the first kept edge not before 40 s
-    assert np.array_equal(bank.estimate.time, record.time[bank.edges])
+    assert np.array_equal(bank.estimate.time, record.time[42::7])
     e, _ = judged(bank, record)
     assert np.linalg.norm(e[-1, :3]) < 5.0 * DEGREE
 
@@ -474,27 +354,6 @@ def test_gaps_of_the_gyro_are_reported_whether_hypotheses_were_many_or_one(durat
         (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
     ]
     assert multiple_model.run(record, belief, every=5).estimate.events == ()
-
-
-@pytest.mark.parametrize("kind", ["direction", "vector", pytest.param("attitude", marks=pytest.mark.slow)])
-def test_noise_by_axis_is_that_of_the_filter(kind):
-    """A bank of one hypothesis, its attitude measured first, and reported at the end of the record."""
-    whole = np.array([[1.0, 0.2, 0.1], [0.2, 2.0, 0.4], [0.1, 0.4, 3.0]]) * 1e-6
-    at, r = np.arange(1.0, 41.0), np.array([0.6, 0.0, 0.8])
-    if kind == "attitude":
-        q = np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
-        second = VectorMeasurements(sensor="second", kind=kind, time=at, attitude=q, covariance=whole)
-    else:
-        measured = {"vector_b": np.tile(r, (40, 1)), "reference_f": r}
-        second = VectorMeasurements(sensor="second", kind=kind, time=at, **measured, covariance=whole)
-    first = tracker([0.5], [1.0, 0.0, 0.0, 0.0], 3e-3)
-    record = ImuRecord(time=np.arange(41.0), increments=np.zeros((40, 3)), vectors=(first, second))
-    process = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
-    bank = multiple_model.run(record, process, bias_sigma=1e-4, every=40)
-    start = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
-    rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
-    single = estimation.run(rest, process, start, full_covariance=True)
-    np.testing.assert_allclose(bank.estimate.covariance[-1], single.covariance[-1], rtol=1e-9, atol=1e-20)
 
 
 def test_the_bias_is_found_from_twenty_degrees_an_hour():

@@ -264,13 +264,10 @@ def _need_noise(series: VectorMeasurements) -> None:
             )
 
 
-def innovations_by_sensor(
-    events: Schedule, rows: Array, weight: Array | None = None, processed: Array | None = None
-) -> dict[str, Innovations]:
+def innovations_by_sensor(events: Schedule, rows: Array, weight: Array | None = None) -> dict[str, Innovations]:
     """Return the innovations written by a kernel, e₁, s₁, e₂, s₂, … per measurement, by sensor, with their degrees of freedom.
 
-    Omitted are those not ``processed`` (bool; default: all are), and headings of a vertical vector, whose row is NaN
-    (:func:`skipped_too`).
+    Headings of a vertical vector, whose row is NaN, are omitted (:func:`skipped_too`).
     """
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
@@ -278,10 +275,9 @@ def innovations_by_sensor(
         e, s = rows[mine, 0 : 2 * KINDS[kind] : 2], rows[mine, 1 : 2 * KINDS[kind] : 2]
         share = None if weight is None else weight[mine]
         innovations = Innovations(time=events.series_time[i], innovation=e, variance=s, weight=share)
-        shown = None if processed is None else processed[mine]
         if kind == "heading" and np.isnan(np.sum(e)):
-            shown = ~np.isnan(e[:, 0]) if shown is None else shown & ~np.isnan(e[:, 0])
-        result[sensor] = innovations if shown is None else selected(innovations, shown)
+            innovations = selected(innovations, ~np.isnan(e[:, 0]))
+        result[sensor] = innovations
     return result
 
 

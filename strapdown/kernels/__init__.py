@@ -7,7 +7,7 @@ one record per lane. A function for lanes has no branches that depend on the dat
 (``sqrt`` is :func:`strapdown.kernels.algebra.square_root`), and creates no arrays; others say that they are for scalars only.
 
 - One loop over a record, with the functions of a *body*: ``walk``.
-- Bodies: ``filter`` (N error states, gated by ``gate``), ``six_states``, ``likelihood``, ``hypotheses``, ``montecarlo_run``
+- Bodies: ``filter`` (N error states, gated by ``gate``), ``six_states``, ``likelihood``, ``montecarlo_run``
   (noise too, with the filter of ``montecarlo_six`` or ``montecarlo_filter``).
 - A module whose sizes are known while compiling is a template: :func:`strapdown.kernels.machine.instance` makes a copy with its constants.
 """

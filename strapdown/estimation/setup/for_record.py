@@ -86,7 +86,7 @@ def _by_multiple_models(record: ImuRecord, filter_setup: FilterSetup, problem: s
         covariance=bank.estimate.covariance[row],
     )
     words = (
-        f"{why}: {len(bank.angles)} hypotheses were merged into one at {bank.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
+        f"{why}: {bank.weights.shape[1]} hypotheses were merged into one at {bank.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
         "begins there."
     )
     return Start(state, words, edge)
