@@ -35,6 +35,8 @@ from strapdown.kernels.iterated_update import (
     UNKNOWN,
     UNKNOWN_TILT,
 )
+from strapdown.kernels.measurement import has_heading
+from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import Event
 from strapdown.vectors import KINDS
 
@@ -281,9 +283,10 @@ class Supervision:
 class GatedStepFilter(StepFilter):
     """:class:`strapdown.StepFilter` with a gate and robust weights; ``weight`` is that of the last measurement."""
 
-    def __init__(self, process_noise, initial, error_states=(), *, gate=None, robust=None, **options):
+    def __init__(self, process_noise, initial, error_states=(), *, gate=None, robust=None, time=0.0, **options):
         check_arguments(gate=gate, robust=robust)
         super().__init__(process_noise, initial, error_states, **options)
+        self.time = time
         self.gate, self.robust = gate, robust
         self.weight = 1.0
         self.refused: dict[str, int] = {}
@@ -298,25 +301,25 @@ class GatedStepFilter(StepFilter):
         """Recoveries and lock-outs up to now, in order of time."""
         return self._supervision.events
 
-    def _running(self) -> list[StepFilter]:
-        """Return the filter and the restart candidate."""
-        candidate = self._supervision.candidate
-        return [self] if candidate is None else [self, candidate]
+    def predict(self, delta_theta, dt):
+        """Propagate over one gyro increment, the restart candidate too."""
+        if self._supervision.candidate is not None:
+            self._supervision.candidate.predict(delta_theta, dt)
+        super().predict(delta_theta, dt)
+        self.time += dt
 
     def _measure(self, measurement, sensor):
         """Update with a measurement; count the outcome for the gate."""
-        has_direction = measurement.has_direction(self.attitude)
-        outcome = self._correct(measurement, sensor)
-        if not has_direction:
-            self._skip(sensor)
-        elif outcome != ACCEPTED:
+        outcome = self._judged(measurement, sensor)
+        if outcome != ACCEPTED:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
-        self._supervision.judge(self, sensor, outcome, lambda candidate: candidate._correct(measurement, sensor))
+        self._supervision.judge(self, sensor, outcome, lambda candidate: candidate._judged(measurement, sensor))
         return outcome == ACCEPTED
 
-    def _correct(self, measurement: Any, sensor: str) -> int:
+    def _judged(self, measurement: Any, sensor: str) -> int:
         """Update with a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
-        if not measurement.has_direction(self.attitude):
+        R = rotation_matrix(tuple(self.attitude.tolist()))
+        if measurement.kind == "heading" and not has_heading(R, measurement.z):
             return PASSED_OVER
         threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
         others = np.concatenate([self.bias, self.values])

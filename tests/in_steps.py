@@ -59,8 +59,8 @@ def run(record, process_noise, initial, error_states=(), **options):
         while events and events[0][0] <= end:
             t, i, k = events.pop(0)
             if t > now:
-                f.predict(delta * ((t - now) / whole), time=t)
-                now = t
+                f.predict(delta * ((t - now) / whole), t - now)
+                now = f.time = t
             series, skipped = record.vectors[i], sum(f.skipped.values())
             f.update(series, k)
             if sum(f.skipped.values()) == skipped:
@@ -75,7 +75,8 @@ def run(record, process_noise, initial, error_states=(), **options):
         whole = end - record.time[n]
         now = give_until(end)
         if end > now:
-            f.predict(delta * ((end - now) / whole), time=end)
+            f.predict(delta * ((end - now) / whole), end - now)
+            f.time = end
         rows.append((f.attitude, f.bias, f.values, f.P))
     attitude, bias, values, P = (np.array(column) for column in zip(*rows, strict=True))
     ends = np.cumsum([block.size for block in error_states])[:-1]
@@ -92,7 +93,6 @@ def run(record, process_noise, initial, error_states=(), **options):
         refused={sensor: f.refused.get(sensor, 0) for sensor in sensors},
         skipped={sensor: f.skipped.get(sensor, 0) for sensor in sensors},
         events=tuple(sorted([*estimation.gaps(record), *f.events], key=lambda event: event.start)),
-        state=f.state(),
     )
 
 

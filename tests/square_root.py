@@ -7,7 +7,7 @@ another one, which never subtracts: ``R`` of ``[R Φᵀ; N]``, ``Nᵀ N = Q``, a
 
 import numpy as np
 
-from strapdown import kinematics
+from strapdown import kinematics, quaternion
 from strapdown.estimation.step_filter import StepFilter
 
 
@@ -35,21 +35,17 @@ class SquareRootFilter(StepFilter):
         super()._sub_step(part, dt)
         self._set_root(triangle(np.vstack([self.root @ self.F.T, root_of(self.Q)])))
 
-    def _filterpy_update(self, residual, H, R):
-        """Return the gain times the residual; the root becomes that about the corrected state."""
+    def _correct(self, residual, H, R):
+        """Correct the state; the root becomes that in the tangent space there."""
         d, n = H.shape
         V = np.linalg.cholesky(R)
         whole = triangle(np.block([[V.T, np.zeros((d, n))], [self.root @ H.T, self.root]]))
-        self.root = whole[d:, d:]
-        return whole[:d, d:].T @ np.linalg.solve(whole[:d, :d].T, residual)
-
-    def _move(self, correction, P):
-        """Move the state, and its root to the tangent space there."""
-        before = self.attitude
-        super()._move(correction, P)
-        G = np.eye(len(P))
+        correction, before = whole[:d, d:].T @ np.linalg.solve(whole[:d, :d].T, residual), self.attitude
+        self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
+        T, G = self._motion.turning_matrix(before, self.attitude), np.eye(n)
         G[:3, :3] = kinematics.right_jacobian(correction[:3])
-        self._set_root(self.root @ (self._motion.turning_matrix(before, self.attitude) @ G).T)
+        self.bias, self.values = self.bias + correction[3:6], T[6:, 6:] @ (self.values + correction[6:])
+        self._set_root(whole[d:, d:] @ (T @ G).T)
 
     def _set_root(self, root):
         self.root, self.P = root, root.T @ root

@@ -334,10 +334,10 @@ def test_single_steps_turn_the_states_that_are_carried_with_the_attitude():
     state = dataclasses.replace(state, attitude=off, values=np.linspace(-0.3, 0.4, block.size), covariance=P)
     whole = estimation.run(record, NOISE, state, (block,), full_covariance=True)
     names = [series.sensor for series in record.vectors]
-    steps = StepFilter(NOISE, state, (block,), sensors=names, time=record.time[0])
+    steps = StepFilter(NOISE, state, (block,), sensors=names)
     samples = sorted((time, i, k) for i, series in enumerate(record.vectors) for k, time in enumerate(series.time))
     for n, delta in enumerate(record.increments, 1):
-        steps.predict(delta, time=record.time[n])
+        steps.predict(delta, record.time[n] - record.time[n - 1])
         while samples and samples[0][0] <= record.time[n] + 1e-9:
             _, i, k = samples.pop(0)
             steps.update(record.vectors[i], k)

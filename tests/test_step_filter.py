@@ -16,7 +16,6 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
@@ -74,24 +73,6 @@ def begun(record, option):
 
 
 IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
-
-
-# ------------------------------------------------------------------------------------------------------------------ the clock
-
-
-def test_the_clock_of_given_stamps_is_theirs():
-    stamps = 1.7e9 + np.cumsum(generator(1, 0, "stamps").uniform(0.005, 0.015, 200))
-    f, other = StepFilter(NOISE, start(), time=1.7e9), StepFilter(NOISE, start(), time=1.7e9)
-    for k, t in enumerate(stamps):
-        f.predict([0.0, 0.0, 1e-3], time=t)
-        other.predict([0.0, 0.0, 1e-3], t - (stamps[k - 1] if k else 1.7e9))
-        assert f.time == t
-        for step_filter in (f, other):
-            step_filter.update(sample("direction", X, X, 0.1))
-    assert np.array_equal(f.P, other.P)
-    assert other.time == pytest.approx(stamps[-1], abs=200 * np.spacing(1.7e9))
-    f.predict([0.0, 0.0, 1e-3], time=stamps[-1])
-    assert f.repeated == 1
 
 
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
@@ -165,8 +146,8 @@ def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, o
     assert np.array_equal(both.covariance, without.covariance)
     assert estimation.smooth(edges, NOISE, start(), blocks, **options).skipped == both.skipped
     f = GatedStepFilter(NOISE, start(), blocks, sensors=("north", "up"), **options)
-    for k, t in enumerate(time):
-        f.predict(np.zeros(3), time=t)
+    for k in range(8):
+        f.predict(np.zeros(3), 0.1)
         f.update(north, k)
         f.update(level, k)
     assert f.skipped == both.skipped
@@ -177,7 +158,7 @@ def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, o
 @pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
 def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
-    f.predict(np.zeros(3), time=0.5)
+    f.predict(np.zeros(3), 0.5)
     P = f.P.copy()
     for value in ([np.nan] * 3, UP if kind == "heading" else [0.0, np.nan, 1.0]):  # a vertical vector has no heading
         if kind == "attitude":

@@ -114,8 +114,9 @@ def run(
     """
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma)
     count("hypotheses", hypotheses, minimum=8)
-    stored = record.time[:: count("every", every)]
+    count("every", every)
     events = forward.prepared(record, process_noise, initial, ()).events
+    stored = record.time[::every]
     first = _first_direction(events, min(stored[-1], np.nextafter(record.time[-1], 0.0)))
     began = events.time[first]
     states, rest = start(events, first, initial, hypotheses), _after(record, began, int(events.sensor[first]))

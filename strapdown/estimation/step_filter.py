@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import filterpy.kalman
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError, array, finite, instance, non_negative, one_of
+from strapdown.checks import Array, InputError, array, instance, non_negative, one_of
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.features import refuse
@@ -25,25 +25,6 @@ from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import LARGEST_TURN
 from strapdown.vectors import VectorMeasurements
-
-
-class Measurement(NamedTuple):
-    """A measurement, as :func:`strapdown.kernels.filter.rows_and_axes` takes it."""
-
-    kind: str
-    z: tuple[float, ...]
-    """The measured vector over ``length``, body axes."""
-    frame: tuple[float, ...]
-    """The triad of the reference by rows, or the measured quaternion and zeros."""
-    noise: Array
-    """Covariance of ``z``, body axes (3, 3); for a heading its variance on the diagonal."""
-    length: float
-    """Length of a vector's reference; else 1."""
-    turning: tuple[float, ...] = (0.0,) * 9
-
-    def has_direction(self, attitude: Array) -> bool:
-        """Return whether the measurement has information: all except the heading of a vector that is vertical at this attitude."""
-        return self.kind != "heading" or bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
@@ -60,8 +41,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     sensors : sequence of str, optional
         Names of the sensors; with error states no other name is accepted. Default: with error states, the sensors that they affect, if
         any; otherwise any name.
-    time : float
-        Time of the initial state, s.
 
     See Also
     --------
@@ -72,15 +51,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     Attributes in addition to those of filterpy's class:
 
     - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the error states (m,), in the order of their
-      declarations, all at ``time``, s;
+      declarations;
     - ``nis`` of the last measurement that was not skipped;
-    - ``skipped``, by sensor: number of measurements without information: missing (NaN) ones and headings of a vertical vector;
-    - ``repeated``: number of gyro samples without duration.
+    - ``skipped``, by sensor: number of measurements without information: missing (NaN) ones and headings of a vertical vector.
 
     Examples
     --------
     >>> steps = StepFilter(noise, start)  # doctest: +SKIP
-    >>> steps.predict(record.increments[0], time=record.time[1])  # doctest: +SKIP
+    >>> steps.predict(record.increments[0], record.intervals[0])  # doctest: +SKIP
     >>> steps.update(record.vectors[0], 0)  # doctest: +SKIP
     """
 
@@ -91,7 +69,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         error_states: Sequence[ErrorStates] = (),
         *,
         sensors: Sequence[str] = (),
-        time: float = 0.0,
     ) -> None:
         check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
@@ -99,77 +76,45 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         need_none(self.error_states, "this filter")
         if isinstance(sensors, str):
             raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
-        about = {sensor: block.name for block in self.error_states for sensor in block.effects}
-        for sensor, block in about.items() if sensors else ():
-            one_of(f"{block}: sensor", sensor, sensors)
-        self.sensors = (tuple(sensors) or tuple(about)) if self.error_states else ()
+        affected = [sensor for block in self.error_states for sensor in block.effects]
+        for sensor in affected if sensors else ():
+            one_of("sensor of error_states", sensor, sensors)
+        self.sensors = tuple(sensors or affected) if self.error_states else ()
         n = 6 + len(state.values)
         super().__init__(dim_x=n, dim_z=2)
         self.x, self.x_prior, self.x_post = np.zeros((3, n))
         self.y, self.z, self.K = np.zeros(2), np.zeros(2), np.zeros((n, 2))
         self.attitude, self.bias, self.values = state.attitude.copy(), state.bias.copy(), state.values.copy()
         self.P, self.process_noise = state.covariance.copy(), process_noise
-        self.time = finite("time", time, unit="s")
-        self.nis, self.repeated = 0.0, 0
-        self.skipped: dict[str, int] = {}
+        self.nis, self.skipped = 0.0, dict[str, int]()
         self._models: dict[tuple[str, str], modelling.Model] = {}
         self._motion = self._model("", "vector")
 
-    def state(self) -> State:
-        """Return the present state.
-
-        Returns
-        -------
-        State
-            Attitude, bias, error states and covariance at ``time``.
-        """
-        P = 0.5 * (self.P + self.P.T)
-        return State(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
-
-    def predict(self, delta_theta: ArrayLike, dt: float | None = None, *, time: float | None = None) -> None:
-        """Propagate over one gyro increment.
+    def predict(self, delta_theta: ArrayLike, dt: float) -> None:
+        """Propagate over one gyro increment; ``F`` and ``Q`` are then those of the last of its sub-steps.
 
         Parameters
         ----------
         delta_theta : array_like (3,)
             Rate integrated over the step, rad, body axes.
-        dt : float, optional
-            Duration of the step, s. A step without duration is counted as ``repeated``.
-        time : float, optional
-            Alternative to ``dt``: end of the step, s.
+        dt : float
+            Duration of the step, s.
 
         Raises
         ------
         InputError
-            If neither or both are given, if the end lies before the filter's time, or if the increment is too large to be an angle.
+            If the duration is negative, or the increment is too large to be an angle.
         """
-        increment = array("delta_theta", delta_theta, (3,))
-        if np.max(np.abs(increment)) > LARGEST_TURN:
+        left, dt = array("delta_theta", delta_theta, (3,)), non_negative("dt", dt, unit="s")
+        if np.max(np.abs(left)) > LARGEST_TURN:
             raise InputError(
-                f"delta_theta is {increment}, too large for the rotation between two samples; it is the rate times dt, rad: check the unit"
+                f"delta_theta is {left}, too large for the rotation between two samples; it is the rate times dt, rad: check the unit"
             )
-        if (dt is None) == (time is None):
-            raise InputError("give either dt, the duration of the step in s, or time, its end")
-        step = finite("time", time, unit="s") - self.time if dt is None else non_negative("dt", dt, unit="s")  # type: ignore[arg-type]
-        if step < 0.0:
-            raise InputError(f"time is {time:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
-        self.repeated += step == 0.0
-        self._predict(increment, step)
-        self.time = self.time + step if time is None else float(time)
-
-    def _running(self) -> list[StepFilter]:
-        """Return the filters that are propagated together."""
-        return [self]
-
-    def _predict(self, increment: Array, left: float) -> None:
-        """Propagate in sub-steps, each as long as the series and the decay rates of the states allow."""
-        while left > 0.0:
-            squared = max(turn_squared(increment, left, state.bias) for state in self._running())
-            longest = float(min(step_within(squared, left), self._motion.limit))
-            part = increment * (longest / left)
-            for state in self._running():
-                state._sub_step(part, longest)
-            increment, left = increment - part, left - longest if longest < left else 0.0
+        while dt > 0.0:  # sub-steps as long as the series and the decay rates of the states allow
+            longest = float(min(step_within(turn_squared(left, dt, self.bias), dt), self._motion.limit))
+            part = left * (longest / dt)
+            self._sub_step(part, longest)
+            left, dt = left - part, dt - longest if longest < dt else 0.0
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, with the kernels' functions."""
@@ -217,24 +162,23 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             one_of("sensor", series.sensor, self.sensors)
         sample = series.taken([k])
         events = schedule((sample,), -np.inf, np.inf, anisotropic=True)
-        if not len(events.time):
-            return self._skip(series.sensor)
-        C = np.zeros((3, 3))
-        C[np.triu_indices(3)] = C.T[np.triu_indices(3)] = events.body_noise[0]
-        z = (0.0, 0.0, 0.0) if series.kind == "attitude" else tuple(events.vector_b[0].tolist())
+        z = tuple(events.vector_b[0].tolist()) if len(events.time) and series.kind != "attitude" else (0.0, 0.0, 0.0)
+        vertical = series.kind == "heading" and not has_heading(rotation_matrix(tuple(self.attitude.tolist())), z)
+        if not len(events.time) or vertical:
+            self.skipped[series.sensor] = self.skipped.get(series.sensor, 0) + 1
+            return False
+        noise = np.zeros((3, 3))
+        noise[np.triu_indices(3)] = noise.T[np.triu_indices(3)] = events.body_noise[0]
+        # As `rows_and_axes` of the kernels takes it: over the length of a whole vector's reference.
         length = float(np.linalg.norm(sample.references_f[0])) if series.kind == "vector" else 1.0
-        return self._measure(Measurement(series.kind, z, tuple(events.triads[0].tolist()), C, length), series.sensor)
+        frame, still = tuple(events.triads[0].tolist()), (0.0,) * 9
+        measurement = SimpleNamespace(kind=series.kind, z=z, frame=frame, noise=noise, length=length, turning=still)
+        return self._measure(measurement, series.sensor)
 
     predict_update = update
 
-    def _skip(self, sensor: str) -> bool:
-        self.skipped[sensor] = self.skipped.get(sensor, 0) + 1
-        return False
-
-    def _measure(self, measurement: Measurement, sensor: str) -> bool:
+    def _measure(self, measurement: SimpleNamespace, sensor: str) -> bool:
         """Update with a measurement."""
-        if not measurement.has_direction(self.attitude):
-            return self._skip(sensor)
         model, x = self._model(sensor, measurement.kind), np.concatenate([self.attitude, self.bias, self.values])
         kernels = machine.instance(filter, STRUCTURE=model.structure)
         rows, residual, axes, _, _ = kernels.rows_and_axes(0, x, measurement, model.numbers, 0.0)
@@ -242,25 +186,20 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         y, H, R = unit * np.array(residual), unit * np.array(rows, np.float64), unit**2 * T @ measurement.noise @ T.T
         self.dim_z = len(y)
         self.nis = float(y @ np.linalg.solve(H @ self.P @ H.T + R, y))
-        correction = self._filterpy_update(y, H, R)
-        G = np.eye(len(self.P))
-        G[:3, :3] = kinematics.right_jacobian(correction[:3])
-        self._move(correction, G @ self.P @ G.T)
+        self._correct(y, H, R)
         return True
 
-    def _filterpy_update(self, residual: Array, H: Array, R: Array) -> Array:
-        """Return the correction (n,) of filterpy's update; P is then the covariance about the corrected state."""
+    def _correct(self, residual: Array, H: Array, R: Array) -> None:
+        """Correct attitude, bias and error states by filterpy's update; P is then the covariance in the tangent space there."""
         super().update(residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R)
         correction, self.x = self.x, np.zeros(len(self.x))
-        return np.asarray(correction)
-
-    def _move(self, correction: Array, P: Array) -> None:
-        """Add the correction to attitude, bias and error states; P is the covariance in the tangent space there."""
         before = self.attitude
         self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
-        self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
         T = self._motion.turning_matrix(before, self.attitude)
-        self.values, self.P = T[6:, 6:] @ self.values, T @ P @ T.T
+        self.bias, self.values = self.bias + correction[3:6], T[6:, 6:] @ (self.values + correction[6:])
+        G = np.eye(len(self.P))
+        G[:3, :3] = kinematics.right_jacobian(correction[:3])
+        self.P = T @ G @ self.P @ (T @ G).T
         self.P_post = self.P.copy()
 
     def _model(self, sensor: str, kind: str) -> modelling.Model:
