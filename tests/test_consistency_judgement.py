@@ -275,7 +275,7 @@ def scenario():
         gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
         sensors=stars(1e-3, 1e-3),
         rate=10.0,
-        duration=40.0,
+        duration=10.0,
         name="rest",
     )
 

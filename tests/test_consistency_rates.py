@@ -34,7 +34,7 @@ SINGLE = (
 
 @pytest.fixture(scope="module")
 def few():
-    return power.single_run_p_values(power.linear_filters(800, 500, np.random.default_rng(1)))
+    return power.single_run_p_values(power.linear_filters(400, 500, np.random.default_rng(1)))
 
 
 @pytest.mark.parametrize("statistic", SINGLE)
@@ -121,7 +121,7 @@ def refused(seeds, probability):
 
 
 def test_the_real_filter_is_seldom_called_wrong():
-    wrong, _ = refused(range(12), 0.99)
+    wrong, _ = refused(range(8), 0.99)
     assert wrong <= 2
 
 

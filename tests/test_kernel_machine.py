@@ -232,7 +232,8 @@ def parts_used() -> set[tuple[str, ...]]:
     """What the package's calls of ``compiled(walk, …)`` name."""
     parts = set()
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        source = path.read_text()
+        for node in ast.walk(ast.parse(source)) if "compiled(walk" in source else ():
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "compiled" and node.args:
                 first, *others = node.args
                 if getattr(first, "id", "") == "walk":
@@ -495,7 +496,7 @@ DAMAGES = [
     lambda content: content[: len(content) // 2],
     lambda content: bytes(len(content)),
     lambda content: content + b"x",
-    *(partial(flipped, place=place) for place in (0.0, 0.01, 0.3, 0.5, 0.8, 1.0)),
+    *(partial(flipped, place=place) for place in (0.0, 0.5, 1.0)),
     lambda content: hashlib.sha256(b"no pickle").digest() + b"no pickle",
 ]
 
@@ -640,12 +641,12 @@ def test_a_digest_depends_on_the_sources_used_and_on_no_others(copied_kernels):
         users = {name: those.union(*(users[k] for k in imports if imports[k] & those)) for name, those in users.items()}
     ask = partial(in_a_new_process, copied_kernels.parent.parent, ASK_DIGESTS)
     before = ask()
-    for edited in ("algebra", "filter", "gate", "montecarlo_run", "walk", "probe_constants", "compiler", "lanes"):
+    for edited in ("algebra", "gate", "probe_constants", "compiler"):
         path = copied_kernels / f"{edited}.py"
         path.write_text(path.read_text() + "# edited")
         after = ask()
         changed = {name for name in before if before[name] != after[name]}
-        assert changed == (set(imports) if edited in ("compiler", "lanes") else users[edited]), edited
+        assert changed == (set(imports) if edited == "compiler" else users[edited]), edited
         before = after
 
 

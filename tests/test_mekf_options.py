@@ -196,9 +196,13 @@ def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
     ], (squares.mean(), *consistency.mean_bounds(1, len(squares), 1.0 - 0.01 / GRID))
 
 
-@pytest.mark.parametrize("schedule", SCHEDULES)
-@pytest.mark.parametrize("kind", sensors())
-@pytest.mark.parametrize("runs", [12, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "schedule", "runs"),
+    [
+        *((kind, list(SCHEDULES)[k % 2], 12) for k, kind in enumerate(sensors())),
+        *(pytest.param(kind, name, 400, marks=pytest.mark.slow) for kind in sensors() for name in SCHEDULES),
+    ],
+)
 def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs):
     for option in OPTIONS:
         if runs == 12 and not ((option, kind, schedule) in alternating(odd=True) and quick(option, kind)):

@@ -13,7 +13,6 @@ from measured import assert_inside, drawn_start, errors, in_body, recoveries, se
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import forward, smoothing
-from strapdown.estimation.error_states import GyroScale
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
 from strapdown.kernels import smoother_loop
@@ -243,7 +242,7 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["one direction, turning", "vectors", "asynchronous", "coning"])
 def test_consistent_and_better_than_the_filter(name: str) -> None:
-    case, runs, rng = CASES[name], 50, np.random.default_rng(2024)
+    case, runs, rng = CASES[name], 25, np.random.default_rng(2024)
     nees, squares = [], []
     for _ in range(runs):
         record, initial = simulated(case, rng)
@@ -280,12 +279,12 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
         angle_random_walk=wrong * case.noise.angle_random_walk, rate_random_walk=wrong * case.noise.rate_random_walk
     )
     nees = []
-    for _ in range(60):
+    for _ in range(30):
         record, initial = simulated(case, rng)
         middle = len(record.time) // 2
         estimate = estimation.smooth(record, noise, initial, full_covariance=True)
         nees.append(consistency.nees(errors(estimate, record.truth)[middle], estimate.covariance[middle]))
-    low, high = consistency.mean_bounds(6, 60)
+    low, high = consistency.mean_bounds(6, 30)
     mean = np.mean(nees) / 6.0
     assert mean > high if above else mean < low
 
@@ -461,8 +460,8 @@ def nees_of_recoveries(runs: int) -> np.ndarray:
 
 
 def test_after_a_recovery_it_is_consistent() -> None:
-    mean = nees_of_recoveries(40).mean(axis=0) / 6.0
-    assert_inside(mean, 6, 40, 0.999)
+    mean = nees_of_recoveries(20).mean(axis=0) / 6.0
+    assert_inside(mean, 6, 20, 0.999)
 
 
 @pytest.mark.slow
@@ -520,7 +519,7 @@ def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_re
 # ------------------------------------------------------------------------------------------------------------------------ kernels
 
 
-@pytest.mark.parametrize("intervals", [*range(1, 11), 16, 17])
+@pytest.mark.parametrize("intervals", [1, 2, 3, 7, 8, 9, 16, 17])
 def test_any_number_of_segments(intervals: int) -> None:
     # Segments are taken in groups of eight, the last of which may be smaller.
     case = dataclasses.replace(CASES["directions"], attitude_sigma=0.2, bias_sigma=0.02, duration=1.0)
@@ -649,21 +648,13 @@ def test_an_attitude_known_far_better_than_the_noise_of_a_step_stays() -> None:
 
 
 def test_a_filter_that_diverges_is_an_error() -> None:
-    """From starts off by a radian or two: rates without end, and with a scale factor of σ 1 an attitude that is not a number."""
-
-    def diverging(dt: float, sigma: float, every: int, off: list[float]):
-        time, rate = np.arange(41) * dt, np.array([0.1, -0.2, 0.3])
-        at = time[3::every]
-        series = exact("field", "vector", at, DOWN, sigma, quaternion.exp(at[:, None] * rate))
-        record = ImuRecord(time=time, increments=np.tile(dt * rate, (40, 1)), vectors=(series,))
-        return record, estimation.initial_state(quaternion.exp(off), attitude_sigma=1.7, bias_sigma=0.04)
-
-    record, initial = diverging(1e-3, 1e-12, 4, 0.6 * np.random.default_rng(21).standard_normal(3))
+    """From a start off by a radian under measurements to a picoradian."""
+    time, rate = np.arange(41) * 1e-3, np.array([0.1, -0.2, 0.3])
+    at = time[3::4]
+    series = exact("field", "vector", at, DOWN, 1e-12, quaternion.exp(at[:, None] * rate))
+    record = ImuRecord(time=time, increments=np.tile(1e-3 * rate, (40, 1)), vectors=(series,))
+    off = quaternion.exp(0.6 * np.random.default_rng(21).standard_normal(3))
+    initial = estimation.initial_state(off, attitude_sigma=1.7, bias_sigma=0.04)
     noise = ProcessNoise(angle_random_walk=1e-16, rate_random_walk=1e-15)
     with pytest.raises(InputError, match="times as precise as the state"):  # before it diverges
         estimation.smooth(record, noise, initial)
-    record, initial = diverging(1.0, 1e-3, 1, [1.5, -1.0, 0.8])
-    noise = ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-6)
-    scale = GyroScale(scale_sigma=1.0, misalignment_sigma=1e-3)
-    with pytest.raises(InputError, match=r"has diverged before"):
-        estimation.run(record, noise, initial, (scale,))
