@@ -73,11 +73,6 @@ def test_simultaneous_bounds_hold_for_independent_and_for_equal_epochs():
     assert wrong[1] < 0.005 * trials  # and conservative for equal ones
 
 
-def test_a_verdict_has_two_sides():
-    for factor, expected in ((0.5, False), (1.0, True), (2.0, False)):
-        assert Verdict(mean=np.full(5, factor), degrees=6, runs=100, probability=0.99).consistent is expected
-
-
 @pytest.mark.parametrize("bad", [0.0, 1.0, 1.5])
 def test_a_probability_lies_between_0_and_1(bad):
     with pytest.raises(InputError, match="confidence_level"):
@@ -96,14 +91,6 @@ def random_covariances(generator, shape, n=6):
 def test_nees_refuses_subsets_that_are_none(states):
     with pytest.raises(InputError, match="states"):
         consistency.nees(np.zeros(6), np.eye(6), states)
-
-
-def test_whitened_errors_begin_with_those_of_the_marginal():
-    generator = np.random.default_rng(2)
-    P = random_covariances(generator, (5,))
-    e = generator.normal(size=(5, 6))
-    white = consistency.whitened(e, P)
-    assert np.allclose(np.sum(white[:, :3] ** 2, axis=1), consistency.nees(e[:, :3], P[:, :3, :3]))
 
 
 # -------------------------------------------------------------------------------------------------------------------- bounds

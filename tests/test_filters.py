@@ -23,8 +23,6 @@ from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements, triad
 
-OWN = ("mekf", *comparison.EXTENDED, "usque")
-"""Filters of the study in NumPy; the MEKF in the same way, as a check."""
 BODY = motion.HarmonicRates(
     mean=(0.05, -0.1, 0.3), harmonics=(motion.Harmonic(amplitude=(0.2, 0.1, 0.0), frequency=0.1, phase=0.3),)
 )
@@ -130,9 +128,8 @@ def body_rows_midway(rows, r_b, z):
     return rows @ across @ kinematics.skew(0.5 * (z + r_b))
 
 
-@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("kind", ["direction", "vector", "attitude"])
-def test_nis_is_that_of_the_whole_innovation(name, kind):
+def test_nis_of_mahonys_filter_is_that_of_the_whole_innovation(kind):
     """One update under a prior with correlations: the sum of the whitened squares is eᵀ S⁻¹ e."""
     rng = np.random.default_rng(6)
     M = rng.standard_normal((6, 6)) * 1e-5
@@ -152,7 +149,7 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
     series = VectorMeasurements(sensor="sun", kind=kind, time=[0.0], sigma=sigma, **fields)
     record = resting(series)
     S = H @ initial.covariance[:3, :3] @ H.T + sigma**2 * np.eye(len(rows))
-    nis = filters.run(name, record, BELIEF, initial).innovations["sun"].nis
+    nis = filters.run("mahony", record, BELIEF, initial).innovations["sun"].nis
     np.testing.assert_allclose(nis, [e @ np.linalg.solve(S, e)], rtol=1e-8)
 
 
@@ -166,7 +163,7 @@ def mekf_full(S):
 def test_invariant_filters_never_see_what_one_reference_hides():
     """A turn about the only reference cannot be observed; the variance about it must only grow. The MEKF's reset leaks into it."""
     rng = np.random.default_rng(3)
-    record = simulated(rng, kinds=("direction",), sigma=0.02, intervals=300, measurements=100)
+    record = simulated(rng, kinds=("direction",), sigma=0.02, intervals=90, measurements=30)
     r = REFERENCES["direction"]
     initial = estimation.initial_state(
         quaternion.multiply(quaternion.exp([0.0, 0.9, 0.0]), record.truth.attitude[0]),
@@ -187,8 +184,8 @@ def test_invariant_filters_never_see_what_one_reference_hides():
 # ------------------------------------------------------------------------------------------------------------- agreement
 
 
-@pytest.mark.parametrize("name", OWN)
-def test_own_filters_tend_to_the_mekf_for_small_errors(name):
+def test_the_unscented_filter_tends_to_the_mekf_for_small_errors():
+    """Of the others a slow reference says more."""
     rng = np.random.default_rng(11)
     record = simulated(
         rng, intervals=60, measurements=10, kinds=("direction", "attitude"), sigma=1e-5, noise=(1e-6, 1e-9)
@@ -196,7 +193,7 @@ def test_own_filters_tend_to_the_mekf_for_small_errors(name):
     noise = estimation.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-9)
     initial = started(record, rng, attitude_sigma=1e-4, bias_sigma=1e-5)
     reference = estimation.run(record, noise, initial, full_covariance=True)
-    estimate = own_filter(name, noise).run(record, initial)
+    estimate = own_filter("usque", noise).run(record, initial)
     sigma = reference.sigma.max(axis=0)
     assert quaternion.angle_between(estimate.attitude, reference.attitude).max() < 1e-7
     assert np.abs((estimate.bias - reference.bias) / sigma[3:]).max() < 2e-3
@@ -528,23 +525,6 @@ def test_each_sensor_has_its_own_gains():
         np.testing.assert_array_equal(*(getattr(estimate, part) for estimate in estimates))
 
 
-def test_mahony_learns_a_constant_bias_with_its_default_gains():
-    """At rest under two vectors the bias error falls with time: a gain of the wrong sign would let it grow."""
-    n, bias = 6000, np.array([4e-3, -3e-3, 5e-3])
-    time = np.arange(n + 1) / 10.0
-    vectors = tuple(
-        series_of(name, "direction", time[1:], np.tile(r, (n, 1)), r, 0.01)
-        for name, r in (("up", [0.0, 0.0, 1.0]), ("north", [1.0, 0.0, 0.0]))
-    )
-    record = ImuRecord(time=time, increments=np.tile(bias / 10.0, (n, 1)), vectors=vectors)
-    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.01, bias_sigma=0.01)
-    noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
-    off = np.linalg.norm(filters.run("mahony", record, noise, initial).bias - bias, axis=1) / np.linalg.norm(bias)
-    assert off[0] == 1.0
-    assert 0.0 < off[n // 10] < 0.5
-    assert off[-1] < 1e-3
-
-
 @pytest.mark.parametrize(("kind", "form"), SHARPEST)
 def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
     """``ω_mes = M δθ + n``: M by differences of the truth, Cov n by differences of the measurement."""
@@ -833,27 +813,3 @@ def test_comparing_all_is_one_line_with_a_table():
     silent = filters.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")
     assert np.isnan(silent.summary()["mekf"]["nis"])
     assert "consistent filter" not in str(silent)
-
-
-def test_findings_are_those_of_the_numbers():
-    """Errors and NEES made up: the quicker, the more accurate and the consistent one are three filters."""
-    time = np.arange(0.0, 101.0)
-
-    def outcome(name, after, final, nees, runs=20):
-        error = np.where(time < after, 1.0, final)
-        return comparison.Outcome(
-            case="large", filter=name, time=time, error=np.tile(error, (runs, 1)), nees=np.full((runs, 101), nees)
-        )
-
-    outcomes = (
-        outcome("mekf", 50.0, 1e-3, 3.0),
-        outcome("mahony", 5.0, 4e-3, 0.25),
-        outcome("usque", 60.0, 1.02e-3, 1.0, runs=9),
-        outcome("geometric", 200.0, 1.0, 5.0),
-    )
-    (line,) = comparison.findings(comparison.Result(outcomes=outcomes, figures=()))
-    assert line.startswith(
-        "large (9 runs): fastest to 3°: mahony (5 s); most accurate at the end: mekf, usque (0.06°); "
-    )
-    assert "converged in fewer than 90 % of the runs: geometric; " in line
-    assert line.endswith("second half): usque; mean ANEES/6 of the others there: mekf 3, mahony 0.25, geometric 5.")

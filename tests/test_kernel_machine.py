@@ -58,12 +58,9 @@ def foreign(code: FunctionType, **names: object) -> FunctionType:
 
 
 def test_functions_from_elsewhere_are_refused():
-    with pytest.raises(TypeError, match=r"does not live in strapdown\.kernels; move it there"):
-        machine.compiled(lambda x: x)
-    with pytest.raises(TypeError, match="does not live in"):
-        machine.compiled(math.sqrt)
-    with pytest.raises(TypeError, match="does not live in"):
-        machine.compiled(estimation.initial_state)
+    for function in (lambda x: x, math.sqrt, estimation.initial_state):
+        with pytest.raises(TypeError, match=r"does not live in strapdown\.kernels; move it there"):
+            machine.compiled(function)
 
 
 def test_a_kernel_that_names_a_module_is_refused():
@@ -74,17 +71,10 @@ def test_a_kernel_that_names_a_module_is_refused():
 # ---------------------------------------------------------------------------------------------------- compiling
 
 
-def test_compiled_once():
+def test_compiled_once_and_the_function_stays_plain():
     assert machine.compiled(walk, six_states) is machine.compiled(walk, six_states)
     assert machine.helper(algebra.dot) is machine.helper(algebra.dot)
-
-
-def test_the_plain_function_stays_plain():
-    machine.helper(algebra.dot)
-    assert isinstance(algebra.dot, FunctionType)
-    machine.compiled(walk, six_states)
-    assert isinstance(walk, FunctionType)
-    assert isinstance(six_states.predict, FunctionType)
+    assert all(isinstance(function, FunctionType) for function in (algebra.dot, walk, six_states.predict))
 
 
 def is_nan(x):

@@ -30,6 +30,14 @@ STATES = {
 """With the structure of tests/test_error_states_recovery.py; sensors of other kinds have no states here."""
 
 
+CASES = [
+    pytest.param(states, option, marks=pytest.mark.slow if STATES[states] and option == "plain" else [])
+    for states in STATES
+    for option in OPTIONS
+]
+"""In the default run error states come with a gate only: each takes seconds to compile."""
+
+
 def record_for(states):
     """Return a record with sensors of three kinds, or with two whole vectors for the states."""
     record = record_of()
@@ -95,19 +103,7 @@ def apart(first, second):
     return max(np.abs(state / sigma).max(), np.abs(covariance).max())
 
 
-def quick(states, option):
-    """Return whether it is in the default run, in which error states come with a gate only: each takes seconds to compile."""
-    return not STATES[states] or option != "plain"
-
-
-@pytest.mark.parametrize(
-    ("states", "option"),
-    [
-        pytest.param(states, option, marks=[] if quick(states, option) else pytest.mark.slow)
-        for states in STATES
-        for option in OPTIONS
-    ],
-)
+@pytest.mark.parametrize(("states", "option"), CASES)
 def test_equals_the_record(states, option):
     record, options, blocks = record_for(states), OPTIONS[option], STATES[states]
     initial = begun(record, option)
@@ -150,14 +146,7 @@ def test_error_states_equal_the_record_to_the_bit(option):
 
 
 @pytest.mark.parametrize("shifts", [(0.0, 0.0, 0.0, 0.0), (0.0, -0.0071, -0.003, -0.003)], ids=["edges", "between"])
-@pytest.mark.parametrize(
-    ("states", "option"),
-    [
-        pytest.param(states, option, marks=[] if quick(states, option) else pytest.mark.slow)
-        for states in STATES
-        for option in OPTIONS
-    ],
-)
+@pytest.mark.parametrize(("states", "option"), CASES)
 def test_late_measurements_lead_to_the_same_bits(states, option, shifts):
     """All at common stamps, which are the gyro's edges, or most between them; the first sensor's begin at the start."""
     record, options, blocks = record_for(states), OPTIONS[option], STATES[states]
@@ -225,18 +214,6 @@ def test_lock_outs_that_go_on_are_one_event():
     assert (event.kind, event.sensor, event.value) == ("lock-out", "wrong", 11.0)
     assert (event.start, event.end) == (pytest.approx(3.0), pytest.approx(4.0))
     assert live.refused == {"up": 0, "wrong": 11}
-
-
-def test_a_rate_is_its_increment_over_the_interval():
-    up = VectorSensor(name="up", reference_f=[0.0, 0.0, 1.0], sigma=1e-2, rate=10.0)
-    rates, turns = (LiveFilter(NOISE, start(), sensors=[up]) for _ in range(2))
-    before = 0.0
-    for time in (0.1, 0.25, 0.3):
-        rates.update(time, np.array([0.1, -0.2, 0.3]), up=np.array([0.0, 0.1, 9.81]))
-        turns.update(time, delta_theta=[v * (time - before) for v in (0.1, -0.2, 0.3)], up=np.array([0.0, 0.1, 9.81]))
-        before = time
-    assert same(rates.state(), turns.state())
-    assert rates.time == 0.3
 
 
 def measured_as(kind, sigma, reference, value):

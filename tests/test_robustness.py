@@ -66,7 +66,8 @@ def anees(estimates, records_, rows, every):
 # ------------------------------------------------------------------------------------------------------------------------- the gate
 
 
-def test_thresholds_are_the_quantiles_of_chi_squared():
+def test_constants_are_the_quantiles_of_chi_squared():
+    assert pytest.approx(np.pi / np.sqrt(3.0)) == gating.UNIFORM_SIGMA  # of an angle uniform over a full rotation
     assert np.allclose(Gate(probability=0.99).thresholds, chi2.ppf(0.99, [1, 2, 3]), rtol=1e-12)
     assert Robust(kind="huber").parameters[0, 0] == pytest.approx(1.345**2, rel=0.01)
     assert np.array_equal(Robust(kind="student", degrees_of_freedom=5.0).parameters[:, 1], [6.0, 7.0, 8.0])
@@ -606,11 +607,6 @@ def test_robust_smoothing_is_better_and_consistent():
     assert squares[0] < 0.7 * squares[1]
     assert squares[0] < 0.4 * squares[2]
     assert 0.7 < nees < 1.7
-
-
-def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():
-    draw = generator(1, 0, "uniform").uniform(-np.pi, np.pi, 100_000)
-    assert np.std(draw) == pytest.approx(gating.UNIFORM_SIGMA, rel=5e-3)
 
 
 def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():

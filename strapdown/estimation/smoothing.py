@@ -13,7 +13,6 @@ not even about the bias, for which the candidate that took over has the σ given
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -274,25 +273,18 @@ class _ManyStates:
         if segments.shape[1] == 32:  # of the filter of six states: the blocks of P, not its triangle by rows
             order = np.argsort(covariance_blocks(_places()))
             segments = np.concatenate([segments[:, :11], segments[:, 11 + order], np.zeros((len(segments), 7))], axis=1)
-        states, matrices = np.zeros((4, n + 1)), _zeros(4, n * kernels.W + WIDTH)
+        states, matrices = np.zeros((4, n + 1)), forward.aligned_zeros(4, n * kernels.W + WIDTH)
         noisy = np.array(kernels.NOISY, np.int64)
         others = (
-            _zeros(n * kernels.NOISY_WIDTH),
+            forward.aligned_zeros(n * kernels.NOISY_WIDTH),
             np.ones(len(noisy)),
-            _zeros(3 * kernels.W),
+            forward.aligned_zeros(3 * kernels.W),
             np.zeros(2 * n),
             np.zeros(kernels.SET * max(len(model.last), 1)),
         )
         space = smoother.Workspace._make((*states, *matrices, *others, noisy, len(noisy)))
         models = smoother.Models(model, _with_negative_noise(model))
         compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
-
-
-def _zeros(*shape: int) -> Array:
-    """Return zeros that begin with a cache line; those of NumPy do not, and each vector of eight of their numbers lies in two lines."""
-    whole = np.zeros(math.prod(shape) + WIDTH)
-    first = -(whole.ctypes.data // 8) % WIDTH
-    return whole[first : first + math.prod(shape)].reshape(shape)
 
 
 def _with_negative_noise(model: structure.Model) -> structure.Model:
