@@ -15,9 +15,8 @@ from strapdown import consistency, montecarlo, motion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import ProcessNoise, setup
-from strapdown.estimation.setup import FilterSetup, write_estimate
+from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo import campaign
 from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
 
 
@@ -259,13 +258,6 @@ def test_resolution_is_the_factor_that_bounds_leave(samples):
     assert asked.verdict == "cannot tell"
 
 
-def test_the_summary_is_plain():
-    saved = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
-    assert saved["verdict"] == "not consistent"
-    assert saved["findings"][0]["name"] == "NIS"
-    assert saved["findings"][1]["low"] is None
-
-
 # ------------------------------------------------------------------------------------------------------------ independent runs
 
 
@@ -374,44 +366,6 @@ def test_bounds_are_those_that_decide(plan):
 
 
 # ---------------------------------------------------------------------------------------------------------------- the command
-
-
-@pytest.mark.parametrize(
-    ("options", "status", "verdict"),
-    [
-        ({}, 3, "cannot tell: innovations consistent; attitude and bias not testable from this run"),
-        ({"scale": 1.3}, 1, "not consistent: "),
-        ({"samples": 8}, 3, "cannot tell: "),
-    ],
-)
-def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, options, status, verdict):
-    result, _ = estimate(**options)
-    write_estimate("estimate.h5", result)
-    ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
-    assert ended == status
-    assert verdict in said
-    saved = json.loads((tmp_path / "check.json").read_text())
-    assert said.splitlines()[-1].startswith("Written")
-    assert verdict.startswith(saved["verdict"])
-
-
-def test_check_uses_the_truth_in_the_file(run):
-    result, truth = estimate(bias_error=10.0)
-    write_estimate("estimate.h5", replace(result, truth=truth))
-    status, said, _ = run("check", "estimate.h5")
-    assert status == 1
-    assert "with its truth" in said
-
-
-def test_check_judges_a_campaign(run, succeeds, plan, tmp_path):
-    campaign.run(plan, tmp_path / "few.h5", runs=20)
-    status, said, _ = run("check", "few.h5")
-    assert status == 3  # nor attitude nor bias would have been seen to be wrong by 1.5
-    assert "innovations consistent; attitude and bias not testable from 20 runs: only an error of σ of ×2" in said
-    campaign.run(plan, tmp_path / "runs.h5", runs=200)
-    said = succeeds("check", "runs.h5", "--json", "check.json")
-    assert "runs.h5: 200 runs of " in said
-    assert json.loads((tmp_path / "check.json").read_text())["kind"] == "strapdown montecarlo"
 
 
 def test_check_refuses_what_it_cannot_judge(run, refusal, tmp_path):

@@ -285,21 +285,17 @@ def test_every_command_that_writes_is_held_to_it():
     assert writing == set(FOLDERS) | {name for name in FILES if " " not in name}
 
 
-@pytest.mark.parametrize(("name", "file"), [(name, file) for name, (_, files) in FOLDERS.items() for file in files])
-def test_a_folder_in_the_place_of_a_result_is_reported_before_the_work(there, tmp_path, name, file):
-    (tmp_path / file).mkdir()
-    said = refused_at_once([*FOLDERS[name][0], "--out", tmp_path])
-    assert f"{tmp_path / file} is a folder" in said
-    assert [path.name for path in tmp_path.iterdir()] == [file]
+PLACES = [(name, [*command, "--out"], "", file) for name, (command, files) in FOLDERS.items() for file in files]
+PLACES += [
+    (name, command, target, file)
+    for name, (command, target, others) in FILES.items()
+    for file in (target, *others)
+    if (name, file) != ("montecarlo replay", target)  # which names the campaign, and a replay leaves it as it is
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "file"), [(name, file) for name, (_, *files) in FILES.items() for file in (files[0], *files[1])]
-)
-def test_a_folder_in_the_place_of_a_file_is_reported_before_the_work(there, tmp_path, name, file):
-    command, target, _ = FILES[name]
-    if (name, file) == ("montecarlo replay", target):
-        return  # names the campaign, which a replay leaves as it is
+@pytest.mark.parametrize(("name", "command", "target", "file"), PLACES, ids=[f"{row[0]} {row[3]}" for row in PLACES])
+def test_a_folder_in_the_place_of_a_result_is_reported_before_the_work(there, tmp_path, name, command, target, file):
     (tmp_path / file).mkdir()
     said = refused_at_once([*command, tmp_path / target])
     assert f"{tmp_path / file} is a folder" in said

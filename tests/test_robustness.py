@@ -9,7 +9,7 @@ from measured import assert_inside, drawn_start, errors, recoveries, turn_to
 from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
-from strapdown.estimation import gating, setup
+from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
@@ -465,20 +465,6 @@ def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
     assert estimate.refused["c"] == len(c.time)
     assert estimate.refused["a"] + estimate.refused["b"] <= 2
     assert quaternion.angle_between(estimate.attitude[-1], record.truth.attitude[-1]) < 5e-3
-
-
-def test_a_recovery_is_reported_in_the_file(tmp_path):
-    record = simulate(scenario(duration=3.0), 3)
-    lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
-    estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust())
-    setup.write_estimate(tmp_path / "e.h5", estimate)
-    back = setup.read_estimate(tmp_path / "e.h5")
-    assert back.events == estimate.events
-    assert {event.kind for event in back.events} == {"recovery"}
-    for sensor, innovations in estimate.innovations.items():
-        assert np.array_equal(back.innovations[sensor].weight, innovations.weight)
-        assert back.refused[sensor] == innovations.refused > 0
-    assert "in a row were rejected" in str(next(event for event in back.events if event.kind == "recovery"))
 
 
 # ------------------------------------------------------------------------------------------------------------------- robust updates
