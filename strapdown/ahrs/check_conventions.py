@@ -442,7 +442,7 @@ def _score(misfit: Array, floor: float) -> Array:
 
 SPAN = 4.0
 """Duration of the windows over which vectors are averaged, s: accelerations average out, and the gyro's bias causes a small rotation."""
-MIN_INTERVAL = 0.02
+MIN_INTERVAL = 0.04
 """Minimum interval of the samples of a vector used, s."""
 
 
@@ -454,7 +454,7 @@ class _Sensor(NamedTuple):
     known: np.ndarray
     """Which of them there are."""
     size: Array
-    """Magnitudes of all samples that there are."""
+    """Their magnitudes, of those that there are."""
     strength: float
     """Their median."""
 
@@ -463,11 +463,11 @@ _Sensors = Mapping[str, _Sensor]
 
 
 def _sensor(vectors: Array, step: int) -> _Sensor:
-    """Return the samples of a vector, with every ``step``-th to be used."""
-    size = lengths(vectors)
+    """Return every ``step``-th sample of a vector."""
+    size = lengths(vectors[::step])
     known = np.isfinite(size)
     size = size if known.all() else size[known]
-    return _Sensor(vectors[::step], known[::step], size, median(size))
+    return _Sensor(vectors[::step], known, size, median(size))
 
 
 class _Windows(NamedTuple):

@@ -261,8 +261,8 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
         parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
     if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
         parts, part = rest_length(recording.interval)
-        spans = [recording.specific_force[last + 1 - parts * part : last + 1] for last in at_rest.last]
-        force = lengths(np.array([np.nanmean(span, axis=0) for span in spans]))
+        spans = recording.specific_force[np.add.outer(at_rest.last, np.arange(1 - parts * part, 1))]
+        force = lengths(np.nanmean(spans, axis=1))
         deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
         if deviation > MAX_DEVIATION:
             parameters = replace(parameters, accelerometer_bias_sigma=deviation)

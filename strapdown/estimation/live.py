@@ -203,7 +203,7 @@ class LiveFilter:
         """Return the kernel's arrays."""
         sensors, most = list(self._sensors.values()), len(length)
         declared = np.array([_row(vectors, place) for place, vectors in enumerate(sensors)]).reshape(-1, kernel.ROW)
-        series = np.array([[0, 0, 0, KIND_CODES[vectors.kind], 0, 1] for vectors in sensors], np.int64).reshape(-1, 6)
+        series = np.array([[KIND_CODES[vectors.kind], 0, 0, 1] for vectors in sensors], np.int64).reshape(-1, 4)
         noisy = most if any(vectors.anisotropic for vectors in sensors) else 0
         edges, increment = np.full(2, self._time), np.zeros(3)
         time, sensor, value = np.zeros(most), np.zeros(most, np.uint8), np.zeros(3 * most)

@@ -110,11 +110,8 @@ class Schedule:
     @property
     def measurements(self) -> measurement.Measurements:
         """Measurements as the kernels' argument."""
-        (value, values), (sigma, sigmas) = places(self.series_vector_b), places(self.series_sigma)
-        first = self.bounds[:-1]
-        series = np.empty((len(first), 6), np.int64)
-        series[:, 0], series[:, 1], series[:, 2] = values - 3 * first, sigmas - first, first
-        series[:, 3], series[:, 4:] = self.codes, self.frames
+        value, sigma = _joined(self.series_vector_b, (0, 3)).reshape(-1), _joined(self.series_sigma, (0,))
+        series = np.column_stack([self.codes.astype(np.int64), self.bounds[:-1], self.frames])
         noise = np.empty((0, 6)) if self.noise_by_axis is None else self.noise_by_axis
         columns = (*self.order, value, sigma, noise, series, self.triads)
         return measurement.Measurements(*map(read_only, columns))
@@ -161,17 +158,6 @@ def schedule(
         kinds=tuple(series.kind for series in vectors),
         skipped={s.sensor: len(s.time) - len(part.time) for s, part in zip(vectors, parts, strict=True)},
     )
-
-
-def places(columns: Sequence[Array]) -> tuple[Array, np.ndarray]:
-    """Return the first of several arrays, flat, and the offset of each array from its first number.
-
-    With the offsets a kernel reads any of them through the first, by :func:`strapdown.kernels.lane_values.element`.
-    """
-    if not columns:
-        return np.empty(0), np.empty(0, np.int64)
-    addresses = np.array([column.ctypes.data for column in columns], np.int64)
-    return columns[0].reshape(-1), (addresses - addresses[0]) // columns[0].itemsize
 
 
 def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:

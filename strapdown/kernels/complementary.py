@@ -166,7 +166,7 @@ def update(state, e, now, measured, body, out):
     store_innovations(out.innovation, place, y, s)
     if outcome != PASSED_OVER:
         q = load(form, 0)
-        z, R = value_of(measured, place, sensor), rotation_matrix(q)
+        z, R = value_of(measured, place), rotation_matrix(q)
         frame, noise = frame_of(measured, place, sensor), six_at(measured.noise, place)
         turn, M, V = measured_turn(measured.series[sensor, KIND], q, R, z, frame, noise, heading_row(R, z), y[0])
         gain, bias_gain = body.gains[0, sensor], body.gains[1, sensor]

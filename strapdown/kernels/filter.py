@@ -54,7 +54,6 @@ from strapdown.kernels.measurement import (
     VECTOR,
     VERTICAL,
     frame_of,
-    sigma_of,
     six_at,
     value_of,
 )
@@ -989,13 +988,13 @@ def measurement_of(s, body, measured, e):
     shape, at, sensor = STRUCTURE.sensors[s], measured.place[e], measured.sensor[e]
     if LANES > 1 and not PARAMETERS:
         return measurement_in_lanes(s, body, measured, e, at, sensor)
-    z = value_of(measured, at, sensor)
+    z = value_of(measured, at)
     if not shape.isotropic:
         noise = six_at(measured.noise, at)
     elif shape.kind == ATTITUDE:
         noise = (0.0,)
     else:
-        sigma = sigma_of(measured, at, sensor)
+        sigma = measured.sigma[at]
         noise = (sigma * sigma,)
     if PARAMETERS:
         z, noise = with_factors(shape, z, noise, tuple(parameter(body.factors, 3 * sensor + i) for i in AXES))

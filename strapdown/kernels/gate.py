@@ -280,7 +280,7 @@ def iterated_update(form, i, e, measured, passes, options):
     place = measured.place[e]
     sensor = measured.sensor[e]
     kind = measured.series[sensor, KIND]
-    z = value_of(measured, place, sensor)
+    z = value_of(measured, place)
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
     parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]

@@ -23,6 +23,9 @@ from strapdown.kernels.measurement import quaternion_at, vector_at
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.state import store_row
 
+NO_EQUATIONS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Normal matrix and right side for the iron without a change of the field."""
+
 
 class Constants(NamedTuple):
     """Constants of the method, and of a unit."""
@@ -144,6 +147,41 @@ def iron_steps(constants, field, frame, known, time, strength, memory, iron):
         )
         memory.counted[1] += 1
         store_row(iron, k, corrected)
+
+
+def equations_until(constants, field, frame, known, time, strength, k):
+    """Return the equations by the change of the field over ``lag`` rows up to row k; zeros without such a change."""
+    then = k - constants.lag
+    if then < 0 or not is_pair(constants, known[k], time[k], known[then], time[then]):
+        return NO_EQUATIONS
+    return equations_of(
+        vector_at(field, k), quaternion_at(frame, k), vector_at(field, then), quaternion_at(frame, then), strength
+    )
+
+
+def approached(share, sums, values):
+    """Return low-passed numbers after others of the same kind."""
+    return tuple(total + share * (value - total) for total, value in zip(sums, values, strict=True))
+
+
+def added(rows, k, values):
+    """Return the numbers of a row, each increased by a value."""
+    return tuple(rows[k, i] + value for i, value in enumerate(values))
+
+
+def iron_of_all(constants, field, frame, known, time, strength, before, iron):
+    """Write the iron (k, 3) as :func:`iron_steps`, by the changes before and after each row; ``before`` (k, 9) is scratch."""
+    sums = NO_EQUATIONS
+    for k in range(len(time)):
+        equations = equations_until(constants, field, frame, known, time, strength, k)
+        sums = approached(constants.iron_share, sums, equations)
+        store_row(before, k, sums)
+    sums = NO_EQUATIONS
+    for k in range(len(time) - 1, -1, -1):
+        if k + constants.lag < len(time):
+            equations = equations_until(constants, field, frame, known, time, strength, k + constants.lag)
+            sums = approached(constants.iron_share, sums, equations)
+        store_row(iron, k, iron_of(constants, added(before, k, sums), strength))
 
 
 def heading_step(constants, steps, memory, out, k):
@@ -279,40 +317,34 @@ def insert(memory, which, value, step, every):
     memory.median[which] = 0.5 * (ordered[which, (count - 1) // 2] + ordered[which, count // 2])
 
 
-def iron_step(constants, field, frame, known, time, strength, memory):
-    """Return the iron that the change of the field since ``lag`` steps shows, together with all earlier changes."""
-    lag, step, sums, ring = constants.lag, memory.counted[1], memory.sums, memory.ring
-    r = step % lag
-    then = memory.ring_time[r]
-    pair = step >= lag and known and ring[r, 7] > 0.0 and abs(time - then - constants.span) < 2.0 * constants.step
-    old = (ring[r, 3], ring[r, 4], ring[r, 5], ring[r, 6])
-    own = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if pair:
-        change = scale(1.0 / strength, subtract(field, vector_at(ring, r)))
-        # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
-        _, x, y, z = quaternion_multiply((frame[0], -frame[1], -frame[2], -frame[3]), old)
-        right = subtract(
-            transpose_times_vector(rotation_matrix(frame), change), transpose_times_vector(rotation_matrix(old), change)
-        )
-        own = (
-            4.0 * (y * y + z * z),
-            -4.0 * x * y,
-            -4.0 * x * z,
-            4.0 * (x * x + z * z),
-            -4.0 * y * z,
-            4.0 * (x * x + y * y),
-            right[0],
-            right[1],
-            right[2],
-        )
-    for i in range(3):
-        ring[r, i] = field[i]
-    for i in range(4):
-        ring[r, 3 + i] = frame[i]
-    ring[r, 7] = 1.0 if known else 0.0
-    memory.ring_time[r] = time
-    for i in range(9):
-        sums[i] += constants.iron_share * (own[i] - sums[i])
+def is_pair(constants, known, time, known_then, then):
+    """Return whether the gyro measures the rotation between two rows with a field: over a gap it does not."""
+    return known and known_then and abs(time - then - constants.span) < 2.0 * constants.step
+
+
+def equations_of(field, frame, then, old, strength):
+    """Return the normal matrix (upper triangle) and the right side for the iron, by the change of the field from ``then`` to ``field``."""
+    change = scale(1.0 / strength, subtract(field, then))
+    # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
+    _, x, y, z = quaternion_multiply((frame[0], -frame[1], -frame[2], -frame[3]), old)
+    right = subtract(
+        transpose_times_vector(rotation_matrix(frame), change), transpose_times_vector(rotation_matrix(old), change)
+    )
+    return (
+        4.0 * (y * y + z * z),
+        -4.0 * x * y,
+        -4.0 * x * z,
+        4.0 * (x * x + z * z),
+        -4.0 * y * z,
+        4.0 * (x * x + y * y),
+        right[0],
+        right[1],
+        right[2],
+    )
+
+
+def iron_of(constants, sums, strength):
+    """Return the iron by low-passed equations, less what a field that varies along the path feigns."""
     h, ridge = constants.iron_interval, constants.ridge
     normal = (
         h * sums[0] + ridge,
@@ -324,7 +356,28 @@ def iron_step(constants, field, frame, known, time, strength, memory):
     )
     iron = solved(factored(normal), (h * sums[6], h * sums[7], h * sums[8]))
     less = 1.0 - constants.feigned * constants.feigned / max(dot(iron, iron), 1e-30)
-    iron = scale(strength * max(less, 0.0), iron)
+    return scale(strength * max(less, 0.0), iron)
+
+
+def iron_step(constants, field, frame, known, time, strength, memory):
+    """Return the iron that the change of the field since ``lag`` steps shows, together with all earlier changes."""
+    lag, step, sums, ring = constants.lag, memory.counted[1], memory.sums, memory.ring
+    r = step % lag
+    old = (ring[r, 3], ring[r, 4], ring[r, 5], ring[r, 6])
+    equations = NO_EQUATIONS
+    if step >= lag and is_pair(constants, known, time, ring[r, 7] > 0.0, memory.ring_time[r]):
+        equations = equations_of(field, frame, vector_at(ring, r), old, strength)
+    for i in range(3):
+        ring[r, i] = field[i]
+    for i in range(4):
+        ring[r, 3 + i] = frame[i]
+    ring[r, 7] = 1.0 if known else 0.0
+    memory.ring_time[r] = time
+    for i in range(9):
+        sums[i] += constants.iron_share * (equations[i] - sums[i])
+    iron = iron_of(
+        constants, (sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]), strength
+    )
     for i in range(3):
         memory.iron[i] += constants.rise_share * (iron[i] - memory.iron[i])
     iron = (memory.iron[0], memory.iron[1], memory.iron[2])

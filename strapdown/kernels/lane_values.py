@@ -62,11 +62,6 @@ def load_like(array, start, like):
     return array.reshape(-1)[start : start + len(like)].copy()
 
 
-def element(array, place):
-    """Return ``array[place]``; a place outside the array is one of the memory before or behind it, where other arrays stand."""
-    return np.lib.stride_tricks.as_strided(array, (2,), (int(place) * array.itemsize,))[1]
-
-
 def with_lane(x, place, value):
     """Return lanes with another number in one of them, whose place is known while compiling."""
     x = x.copy()

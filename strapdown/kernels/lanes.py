@@ -231,11 +231,6 @@ def _store(target: Any, builder: Any, sig: Any, array: Any, start: Any, value: A
     _write(builder, kind, array, start, _converted(builder, value, lanes, Lanes(kind.dtype, lanes.count)))
 
 
-@_instead_of(lane_values.element, lambda array, place: array.dtype(array, types.intp))
-def _element(target: Any, builder: Any, sig: Any, array: Any, place: Any) -> Any:
-    return builder.load(builder.gep(builder.extract_value(array, DATA), [place]))
-
-
 @_instead_of(lane_values.fetch, lambda array, start: types.void(array, types.intp))
 def _fetch(target: Any, builder: Any, sig: Any, array: Any, start: Any) -> None:
     place = builder.gep(builder.extract_value(array, DATA), [start])

@@ -16,7 +16,7 @@ from strapdown.kernels.algebra import (
     matrix_times_vector,
     transpose_times_vector,
 )
-from strapdown.kernels.lane_values import element, select
+from strapdown.kernels.lane_values import select
 
 DIRECTION = 0
 """Kind: a unit direction, two degrees of freedom."""
@@ -44,26 +44,22 @@ class Measurements(NamedTuple):
     sensor: np.ndarray
     """Sensor of each, in order of time (m,)."""
     value: np.ndarray
-    """Three numbers per measurement of the first sensor; ``series`` has the offsets of the others."""
+    """Three numbers per measurement, by place (3 m,)."""
     sigma: np.ndarray
-    """σ of each measurement of the first sensor, likewise."""
+    """σ of each measurement by place (m,)."""
     noise: np.ndarray
     """Covariances in body axes (m, 6) by place, or (0, 6) if σ defines all noise."""
     series: np.ndarray
-    """One row per sensor (sensors, 6), with the columns below."""
+    """One row per sensor (sensors, 4), with the columns below."""
     triads: np.ndarray
     """Right-handed frames (u, v, r) by rows about references r (rows, 9); for an attitude the measured quaternion."""
 
 
-VALUE_ORIGIN = 0
-"""Index that place 0 of a sensor would have in ``value``, and in ``sigma``: each sensor's numbers stay in their original arrays."""
-SIGMA_ORIGIN = 1
-FIRST_PLACE = 2
-KIND = 3
-FIRST_FRAME = 4
+KIND = 0
+FIRST_PLACE = 1
+FIRST_FRAME = 2
 """Row of ``triads`` of a sensor's first measurement, and step in rows to the next measurement's, 0 or 1."""
-FRAME_STEP = 5
-COLUMNS = 6
+FRAME_STEP = 3
 
 
 def vector_at(array, k):
@@ -81,16 +77,10 @@ def six_at(array, k):
     return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
 
 
-def value_of(measured, place, sensor):
+def value_of(measured, place):
     """Return the three numbers of a measurement."""
-    here = measured.series[sensor, VALUE_ORIGIN] + 3 * place
-    value = measured.value
-    return (element(value, here), element(value, here + 1), element(value, here + 2))
-
-
-def sigma_of(measured, place, sensor):
-    """Return σ of a measurement."""
-    return element(measured.sigma, measured.series[sensor, SIGMA_ORIGIN] + place)
+    value, first = measured.value, 3 * place
+    return (value[first], value[first + 1], value[first + 2])
 
 
 def frame_row(measured, place, sensor):

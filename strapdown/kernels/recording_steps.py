@@ -231,7 +231,7 @@ def carry_to_stamps(steps, stamps, limits, out):
         x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
         level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
         beside = (h * (sx * xz + sm * yz), h * (sm * xz + sy * yz))
-        fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz))
+        fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz + iron))
         across = multiply(R, block_at(P, 3))
         first_row, second_row = across[:3], across[3:6]
         across = combine(sx, first_row, sm, second_row) + combine(sm, first_row, sy, second_row) + scale(h, across[6:])
@@ -239,13 +239,11 @@ def carry_to_stamps(steps, stamps, limits, out):
             late = stamps.time[n] - stamps.time[first] + stamps.late[n]
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
             q, _ = moved(quaternion_multiply(since, quaternion_at(t, n)), v)
-            q = unit(q)
+            q = renormalized(q)
             R = rotation_matrix(q)
             own = times_transpose_upper(multiply(transpose(R), fixed), transpose(R))
             w = vector_at(stamps.rate, n)
-            own = symmetric_minus_outer(own, scale(-limits.timing, w), w)
-            up = (R[6], R[7], R[8])  # in body axes
-            own = full(symmetric_minus_outer(own, scale(-iron, up), up))
+            own = full(symmetric_minus_outer(own, scale(-limits.timing, w), w))
             store_row(out.attitude, n, q)
             store_row(out.bias, n, bias)
             store_row(out.variance, n, (own[0], own[4], own[8]))

@@ -22,7 +22,6 @@ from strapdown.kernels.measurement import (
     has_heading,
     heading_error,
     heading_row,
-    sigma_of,
     value_of,
 )
 from strapdown.kernels.rotation import rotation_matrix
@@ -97,8 +96,8 @@ def update(state, e, now, measured, body, out):
     s = measured.sensor[e]
     kind = measured.series[s, KIND]
     frame = frame_of(measured, at, s)
-    z = value_of(measured, at, s)
-    sigma = sigma_of(measured, at, s)
+    z = value_of(measured, at)
+    sigma = measured.sigma[at]
     variance = sigma * sigma
     if kind == ATTITUDE:
         q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, frame[:4], z)

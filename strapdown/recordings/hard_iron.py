@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.kernels import headings, recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -39,31 +38,14 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     equal intervals, ``known`` (k,) the rows with a field. ``causal``: only rows up to each are used; otherwise those after it too.
     """
     interval = float(np.median(np.diff(time)))
-    lag = max(1, round(SPAN / interval))
+    others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
+    constants, result = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
+    rows = (read_only(column) for column in (field, frame, known, time))
     if causal:
-        others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
-        constants, result = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
-        rows = (read_only(column) for column in (field, frame, known, time))
-        compiled(headings.iron_steps)(constants, *rows, strength, memory(lag, 1), result)
-        return result
-    if len(time) <= lag:
-        return np.zeros((len(time), 3))
-    now, then = quaternion.conjugate(frame[lag:]), quaternion.conjugate(frame[:-lag])
-    change = (field[lag:] - field[:-lag]) / strength
-    # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
-    x, y, z = quaternion.multiply(now, frame[:-lag])[:, 1:].T
-    normal = 4.0 * np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z], axis=1)
-    right = quaternion.rotate(now, change) - quaternion.rotate(then, change)
-    # Over a gap the gyro does not measure the rotation.
-    pair = known[lag:] & known[:-lag] & (np.abs(time[lag:] - time[:-lag] - SPAN) < 2.0 * interval)
-    own = np.column_stack([normal, right]) * pair[:, None]
-    before = np.zeros((lag, own.shape[1]))
-    sums = _integral(np.concatenate([before, own]), interval)
-    sums = sums + _integral(np.concatenate([before, own[::-1]]), interval)[::-1]
-    matrix = sums[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
-    iron = np.linalg.solve(matrix + (CHANGE_NOISE / SIGMA) ** 2 * np.eye(3), sums[:, 6:, None])[..., 0]
-    iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(np.sum(iron**2, axis=1), 1e-30), 0.0)[:, None]
-    return np.asarray(iron)
+        compiled(headings.iron_steps)(constants, *rows, strength, memory(constants.lag, 1), result)
+    else:
+        compiled(headings.iron_of_all)(constants, *rows, strength, np.empty((len(time), 9)), result)
+    return result
 
 
 def parts(interval: float) -> dict[str, Any]:
@@ -101,12 +83,6 @@ def memory(lag: int, capacity: int) -> headings.Memory:
         iron=np.zeros(3),
         total=np.zeros(4),
     )
-
-
-def _integral(rows: Array, interval: float) -> Array:
-    """Return the integral over time, s, of rows (k, m) up to each, with exponential forgetting (:data:`MEMORY`)."""
-    share = interval / MEMORY
-    return np.asarray(low_pass(rows, share) * (interval / -np.expm1(-share)))
 
 
 def low_pass(rows: np.ndarray, step: float) -> Array:

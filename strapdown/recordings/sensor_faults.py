@@ -26,6 +26,8 @@ from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
 """Maximum rate, rad/s, of the samples from which the quantisation step of a gyro is determined."""
+MAX_SLOW = 10_000
+"""Maximum number of rows from which it is determined."""
 MIN_CLIPPED_RATE = 1.0
 """Minimum limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
 MIN_CLIPPED_FORCE = 15.0
@@ -174,7 +176,7 @@ def truncation_step(rate: Array) -> float | None:
 
 def _quantisation(rate: Array) -> float | None:
     """Return the step of which nearly all small rates among (n, 3) are multiples, including zero; None if there is none."""
-    sizes = np.abs(rate)
+    sizes = np.abs(rate[:: 1 + len(rate) // MAX_SLOW])
     slow = np.rint(1e7 * sizes[sizes < SLOW_RATE])
     if np.count_nonzero(slow == 0.0) < 3:
         return None
