@@ -17,7 +17,6 @@ import numpy as np
 from strapdown import kinematics, quaternion
 from strapdown.checks import Array
 from strapdown.estimation import model as modelling
-from strapdown.estimation.error_states import spans
 from strapdown.estimation.forward import gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import State, check_arguments, restart_bias_variance
@@ -206,14 +205,6 @@ def tilt_unknown(attitude: Array, covariance: Array) -> bool:
     return float(np.trace(R @ covariance[:3, :3] @ R.T)) > UNKNOWN_TILT
 
 
-def aged_prior(error_states, values, covariance, dt):
-    """Return values (m,) and covariance (m, m) of the error states after dt, s, without measurements."""
-    transition, driven = np.zeros((2, len(values), len(values)))
-    for block, own in spans(error_states):
-        transition[own, own], driven[own, own] = block.transition(dt), block.process_noise(dt)
-    return transition @ values, transition @ covariance @ transition.T + driven
-
-
 class Supervision:
     """The gate of a step-by-step filter: counters, restart candidate and the events reported up to now."""
 
@@ -392,7 +383,7 @@ class GatedStepFilter(StepFilter):
     def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
         """Return a restart candidate: optional states at their prior, attitude and bias independent of them, with the given uncertainty."""
         (time, *prior), m = self._restart_prior, len(self.values)
-        values, Pc = aged_prior(self.error_states, *prior, self.time - time)
+        values, Pc = modelling.aged_prior(self.error_states, *prior, self.time - time)
         P = np.zeros((6 + m, 6 + m))
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)

@@ -12,7 +12,7 @@ from measured import assert_inside, drawn_start, errors, in_body, recoveries, se
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation import forward, smoothing
+from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
 from strapdown.kernels import smoother_loop
@@ -350,8 +350,8 @@ def test_a_start_half_way_round_is_survived() -> None:
 def filtered_segments(record, noise, initial):
     """Return the segment that starts at each edge, and the filter's segments with the end state."""
     problem = forward.prepared(record, noise, initial, ())
-    _, segments = smoothing.filtered_whole(problem, forward.Options(every=len(record.time)))
-    return smoothing.segments_at_edges(problem, segments), segments
+    _, segments = recovery_segments.filtered_whole(problem, forward.Options(every=len(record.time)))
+    return recovery_segments.starts(record.time, problem.events.time, segments), segments
 
 
 def test_a_bias_that_turns_more_than_the_increments_say() -> None:
@@ -415,57 +415,104 @@ def with_a_turn(record: ImuRecord, edge: int, turn: np.ndarray) -> ImuRecord:
     return ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
 
 
-def test_a_recovery_divides_the_record() -> None:
-    """A start far off, then a turn that the gyro does not show: each part is smoothed separately, what lies between is the filter's."""
+def test_a_lost_stretch_is_reported_by_what_was_measured_from_its_beginning_on() -> None:
     record, initial = far_off(1)
-    record = with_a_turn(record, 120, quaternion.exp([0.3, -1.0, 0.5]))
     filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
     smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-    events = recoveries(filtered)
-    assert len(events) == 2
+    (event,) = recoveries(filtered)
     assert smoothed.events == filtered.events
-    off = np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma), axis=1)
-    names = ("attitude", "bias", "variance", "covariance")
-    begin, state, last = 0, initial, len(record.time) - 1
-    for refused, after in [*((event.start, event.end) for event in events), (np.inf, np.inf)]:
-        first, end = (int(np.searchsorted(record.time, stamp)) for stamp in (refused, after))
-        if begin < first - 1:  # the smoother of the record that ends before the first refusal
-            known = estimation.smooth(
-                records.cut(record, begin, min(first - 1, last)), NOISE, state, gate=GATE, full_covariance=True
-            )
-            part = {n: getattr(smoothed, n)[begin:first] for n in names}
-            assert_same(known, dataclasses.replace(known, **part), 1e-9)
-        assert begin in (0, first) or np.max(off[begin : first if begin > 120 else 120]) < 5.0
-        if end <= last:
-            assert np.max(off[first:end]) > 10.0
-            _, state = estimation.run_part(records.cut(record, begin, end), NOISE, state, gate=GATE)
-        for name in names:
-            np.testing.assert_array_equal(getattr(smoothed, name)[first:end], getattr(filtered, name)[first:end])
-        begin = end
-    for name in names:
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    assert last - first > 10
+    assert np.min(np.max(np.abs(errors(filtered, record.truth) / filtered.sigma)[first:last], axis=1)) > 10.0
+    assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[first:]) < 5.0
+    # The end state is the filter's, and what came before the first refusal has not heard of what came after.
+    for name in ("attitude", "bias", "covariance"):
         np.testing.assert_array_equal(getattr(smoothed, name)[-1], getattr(filtered, name)[-1])
+        np.testing.assert_allclose(getattr(smoothed, name)[0], getattr(filtered, name)[0], rtol=1e-9, atol=1e-15)
+
+
+def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -> None:
+    """A turn in a gap of the gyro's: the sensors are refused from there on."""
+    record, _ = far_off(2)
+    initial = estimation.initial_state(record.truth.attitude[0], attitude_sigma=0.03, bias_sigma=3e-3)
+    middle = 120
+    record = with_a_turn(record, middle, quaternion.exp([0.0, 1.2, 0.7]))
+    both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
+    (event,) = recoveries(both)
+    first = int(np.searchsorted(record.time, event.start))
+    assert middle <= first < middle + 8
+    off = np.abs(errors(both, record.truth) / both.sigma)
+    assert np.max(off[:middle]) < 5.0
+    assert np.max(off[first:]) < 5.0
+    # Before it: the smoother of the record that ends with the first refusal, whose measurement was not processed.
+    known = estimation.smooth(records.cut(record, 0, first - 1), NOISE, initial, gate=GATE, full_covariance=True)
+    before = {n: getattr(both, n)[:first] for n in ("attitude", "bias", "variance", "covariance")}
+    assert_same(known, dataclasses.replace(both, **before), 1e-9)
+    ahead = estimation.run(record, NOISE, initial, gate=GATE)
+    assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
+
+
+def test_what_lies_between_the_first_refusal_and_the_last_candidate_is_the_filters() -> None:
+    """Directions at random for a while, which no candidate can follow."""
+    record, initial = far_off(1)
+    rng = np.random.default_rng(1)
+    vectors = []
+    for s in record.vectors:
+        z = rng.standard_normal((len(s.time), 3))
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+        vectors.append(dataclasses.replace(s, vector_b=np.where((s.time < 0.6)[:, None], z, s.vector_b)))
+    record = dataclasses.replace(record, vectors=tuple(vectors))
+    filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
+    (event,) = recoveries(smoothed)
+    assert event.start < 0.1
+    between = (record.time > event.start) & (record.time < 0.6)
+    for name in ("attitude", "bias", "covariance"):
+        np.testing.assert_array_equal(getattr(smoothed, name)[between], getattr(filtered, name)[between])
+    after = record.time > 0.7
+    assert event.end > 0.8
+    assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[after]) < 5.0
+
+
+def test_several_recoveries_and_a_record_in_parts() -> None:
+    """The second part begins while the filter is lost: what took over then begins with the part at the earliest."""
+    record, initial = far_off(1)
+    twice = with_a_turn(record, 120, quaternion.exp([0.3, -1.0, 0.5]))
+    whole = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
+    assert [event.kind for event in whole.events] == ["recovery", "recovery"]
+    first, second = np.searchsorted(record.time, [event.start for event in whole.events])
+    off = np.max(np.abs(errors(whole, twice.truth) / whole.sigma), axis=1)
+    assert np.max(off[first:120]) < 5.0
+    assert np.max(off[second:]) < 5.0
+    middle = int(np.searchsorted(record.time, whole.events[0].end)) - 8
+    _, state = estimation.run_part(records.cut(twice, 0, middle), NOISE, initial, gate=GATE)
+    rest = records.cut(twice, middle, len(twice.time) - 1)
+    part = estimation.smooth(rest, NOISE, state, gate=GATE, full_covariance=True)
+    off = np.max(np.abs(errors(part, rest.truth) / part.sigma), axis=1)
+    assert np.max(off[: 120 - middle]) < 5.0
+    assert part.events == whole.events
 
 
 def nees_of_recoveries(runs: int) -> np.ndarray:
-    """At the recovery, and later (runs, 3)."""
+    """In the middle of the lost stretch, at the recovery, and later (runs, 3)."""
     nees = []
     for run in range(runs):
         record, initial = far_off(100 + run)
         both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
         (event,) = recoveries(both)
-        last = int(np.searchsorted(record.time, event.end))
-        rows = [last, last + 20, 200]
+        first, last = np.searchsorted(record.time, [event.start, event.end])
+        rows = [(first + last) // 2, last, 200]
         nees.append(consistency.nees(errors(both, record.truth)[rows], both.covariance[rows]))
     return np.array(nees)
 
 
-def test_after_a_recovery_it_is_consistent() -> None:
+def test_lost_stretches_are_consistent() -> None:
     mean = nees_of_recoveries(20).mean(axis=0) / 6.0
     assert_inside(mean, 6, 20, 0.999)
 
 
 @pytest.mark.slow
-def test_after_a_recovery_it_is_consistent_over_many_runs() -> None:
+def test_lost_stretches_are_consistent_over_many_runs() -> None:
     check_consistent(nees_of_recoveries(1000), 0.99)
 
 

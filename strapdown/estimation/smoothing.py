@@ -5,9 +5,15 @@ filter. Each correction of the attitude moves the filter's tangent space and its
 one tangent space to the next by the Jacobians of the rotation vector (:mod:`strapdown.kernels.smoother`, for six states
 :mod:`strapdown.kernels.smoother_loop`). To first order in the errors this is the least-squares estimate over the whole record.
 
-A recovery of a gate divides a record: what came before the first of the refusals that led to it is smoothed separately from what
-comes after it. Between the two the estimate is the filter's, which is wrong there, as the event reports. No information crosses a recovery,
-not even about the bias, for which the candidate that took over has the σ given by :class:`strapdown.estimation.Gate`.
+After a recovery of a gate, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), smoothed
+separately:
+
+- up to the first of the refusals that led to the recovery, from the measurements before it;
+- from the start of the candidate that took over, from the measurements after it. That start usually is the first refusal, so that the
+  interval in which the filter was wrong is estimated correctly;
+- any interval between the two, if candidates failed, is the filter's estimate, which is wrong there, as the event reports.
+
+No information crosses a recovery, not even about the bias, for which the candidate has the σ given by :class:`strapdown.estimation.Gate`.
 """
 
 from __future__ import annotations
@@ -19,18 +25,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.estimation import forward
+from strapdown.estimation import forward, recovery_segments
+from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Options, Problem
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State, covariance_blocks, covariance_matrices
+from strapdown.estimation.recovery_segments import Break, Rerun
+from strapdown.estimation.states import (
+    GateMemory,
+    ProcessNoise,
+    State,
+    covariance_blocks,
+    covariance_matrices,
+)
 from strapdown.kernels import smoother, smoother_loop, structure
 from strapdown.kernels.lane_values import WIDTH
-from strapdown.kernels.machine import compiled, read_only
-from strapdown.records import Estimate, ImuRecord
+from strapdown.kernels.machine import compiled
+from strapdown.records import Estimate, Event, ImuRecord
 
-MAX_CUT = 64
-"""Maximum ratio of the number of sub-steps to that expected from the increments; above it the filter has diverged."""
 MIN_SMOOTHED = 1e-11
 """Minimum smoothed variance, relative to what a backward step subtracts, at which it keeps enough digits."""
 UPPER = np.triu_indices(6)
@@ -70,7 +82,8 @@ def smooth(
     -------
     Estimate
         Smoothed attitude, bias, error states and variances; at the last edge those of the filter. Innovations and events are the
-        filter's. From the first of the refusals that led to a recovery of a gate to the recovery, rows are the filter's.
+        filter's. After a recovery of a gate, if there is a lever arm among the error states, the second trajectory begins at the
+        recovery, and the rows from the first refusal to there are the filter's.
 
     Notes
     -----
@@ -86,10 +99,10 @@ def smooth(
         robust=robust,
     )
     if not problem.model.states:
-        estimate = _smoothed(problem, options, _SixStates(problem))
+        estimate = _Smoother(problem, options, _SixStates(problem)).smoothed()
         if _digits_kept(problem, estimate):
             return estimate
-    estimate = _smoothed(problem, options, _ManyStates(problem))
+    estimate = _Smoother(problem, options, _ManyStates(problem)).smoothed()
     lost = _digits_lost(problem, estimate)
     if lost is not None:
         raise InputError(
@@ -139,56 +152,104 @@ def _added_angle(problem: Problem) -> Array:
     return np.asarray(angle * dt + rate * dt**3 / 3.0)
 
 
-def _smoothed(problem: Problem, options: Options, form: _SixStates | _ManyStates) -> Estimate:
-    """Return the estimate at every edge, with this form of the covariance."""
-    record = problem.record
-    estimate, segments = filtered_whole(problem, options)
-    edges = len(record.time)
-    outputs, begin = form.outputs(edges, options), 0
-    starts = np.arange(edges)
-    if len(segments) > edges:  # some interval in several segments
-        starts = segments_at_edges(problem, segments)
-    for event in estimate.events:
-        if event.kind == "recovery":
-            refused = int(np.searchsorted(record.time, event.start, side="right"))
-            after = int(np.searchsorted(record.time, event.end))
-            if begin < refused:
-                form.go_back(segments, starts[:refused], begin, outputs)
-            for edge in range(max(begin, refused), after):  # the filter's own
-                form.go_back(segments, starts[: edge + 1], edge, outputs)
-            begin = after
-    form.go_back(segments, starts, begin, outputs)
-    return replace(
-        form.estimate(outputs, options),
-        innovations=estimate.innovations,
-        skipped=estimate.skipped,
-        events=estimate.events,
-    )
+@dataclass(frozen=True, eq=False)
+class _Smoother:
+    """A record and the form of the covariance for smoothing it."""
 
+    problem: Problem
+    options: Options
+    form: _SixStates | _ManyStates
 
-def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]:
-    """Return the filter's estimate of a record and all its predictions (:attr:`strapdown.estimation.forward.Passed.segments`)."""
-    usual = most = forward.most_segments(problem)
-    while True:
-        # One row more than expected shows whether more were needed.
-        passed = forward.filtered(problem, replace(options, segments=most + 1, full_covariance=False))
-        if len(passed.segments) - 1 <= most:
-            return passed.estimate, passed.segments
-        # The number of sub-steps depends on the rotation without the bias, which is known only during the run.
-        most *= 4
-        if most > MAX_CUT * usual:
-            raise InputError(
-                "the filter diverged: with its estimate of the bias the body makes many rotations in each gyro interval; "
-                "check the record and the initial state with estimation.run first"
+    def smoothed(self) -> Estimate:
+        """Return the estimate at every edge."""
+        record = self.problem.record
+        estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
+        event_time = self.problem.events.time
+        recovered = recovery_segments.recoveries(estimate.events)
+        edges = len(record.time)
+        outputs = self.form.outputs(edges, self.options)
+        starts = np.arange(edges)
+        if len(segments) > edges:  # some interval in several segments
+            starts = recovery_segments.starts(record.time, event_time, segments)
+        if recovered:
+            self._across_recoveries(*self._reruns(recovered, event_time, segments), segments, outputs)
+        else:
+            self.form.go_back(segments, starts, 0, outputs)
+        return replace(
+            self.form.estimate(outputs, self.options),
+            innovations=estimate.innovations,
+            skipped=estimate.skipped,
+            events=estimate.events,
+        )
+
+    def _across_recoveries(
+        self, breaks: Sequence[Break], reruns: Sequence[Rerun], segments: Array, outputs: Sequence[Array]
+    ) -> None:
+        """Smooth each trajectory of a record, and write its rows."""
+        time = self.problem.record.time
+        stop = recovery_segments.stops(time, breaks)
+        first = recovery_segments.starts(stop, self.problem.events.time, segments)
+        for part in recovery_segments.trajectories(time, breaks, first, segments, reruns):
+            written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
+            smoothed = part.edge <= part.last
+            if smoothed.any():
+                self.form.go_back(part.segments, part.starts[: part.last + 1], part.edge[0], written)
+            for edge in part.edge[~smoothed]:  # the filter's own
+                self.form.go_back(part.segments, part.starts[: edge + 1], edge, written)
+            for out, there in zip(outputs, written, strict=True):
+                if len(out):
+                    out[part.row] = there[part.edge]
+
+    def _reruns(
+        self, recovered: Sequence[Event], event_time: Array, segments: Array
+    ) -> tuple[list[Break], list[Rerun]]:
+        """Return the breaks of a record, and for each the candidate that took over, from its start to the recovery.
+
+        With a lever arm, whose accelerations at the end of a part differ from those of the whole, a trajectory begins with the recovery.
+        """
+        record, gate = self.problem.record, self.options.gate
+        assert gate is not None
+        state = self.problem.initial
+        breaks: list[Break] = []
+        reruns: list[Rerun] = []
+        begin = float(record.time[0])
+        for event in recovered:
+            memory: GateMemory | None = None
+            if not self.problem.model.levers.any():
+                state = self._part(recovery_segments.part(record, begin, event.end), state, self.options).end
+                memory = state.gate
+                begin = event.end
+            gap = recovery_segments.break_of(event, memory, float(record.time[0]))
+            breaks.append(gap)
+            if memory is None or gap.since == gap.end:
+                reruns.append(None)
+                continue
+            bias, variance, counts = recovery_segments.restarted(gate, memory)
+            age = gap.since - memory.start
+            values, P = modelling.aged_prior(self.problem.error_states, memory.values, memory.covariance, age)
+            stop = recovery_segments.stops(record.time, [gap])
+            lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, gap.since)]
+            whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
+            whole[6:, 6:] = P
+            fresh = State(
+                attitude=segments[lost, 4:8],
+                bias=bias,
+                values=values,
+                covariance=whole,
+                gate=replace(memory, counts=counts),
+                unit_sigma=state.unit_sigma,
             )
+            span = recovery_segments.part(record, gap.since, gap.end)
+            problem = forward.prepared(span, self.problem.process_noise, fresh, self.problem.error_states)
+            again = replace(self.options, every=len(span.time), gate=replace(gate, recovery=None))
+            _, rows = recovery_segments.filtered_whole(problem, again)
+            reruns.append((rows, recovery_segments.starts(span.time, problem.events.time, rows)))
+        return breaks, reruns
 
-
-def segments_at_edges(problem: Problem, segments: Array) -> np.ndarray:
-    """Return the index of the segment that starts at each edge; the last row of segments is the end state."""
-    time = problem.record.time
-    first = np.empty(len(time), np.int64)
-    compiled(smoother_loop.locate_edges)(read_only(time), problem.events.time, segments, len(segments) - 1, first)
-    return first
+    def _part(self, part: ImuRecord, state: State, options: Options) -> forward.Passed:
+        """Return the filter's pass over a part of the record."""
+        problem = forward.prepared(part, self.problem.process_noise, state, self.problem.error_states)
+        return forward.filtered(problem, replace(options, every=len(part.time), full_covariance=False))
 
 
 @dataclass(frozen=True, eq=False)
