@@ -68,7 +68,7 @@ def test_a_terminal_has_a_bar(monkeypatch):
     with terminal.progress_bar("runs", 3) as advance:
         advance(2)
         time.sleep(0.3)
-    assert "2/3" in text.getvalue()
+    assert " 67%" in text.getvalue()
 
 
 def test_a_fault_ends_the_progress(said):

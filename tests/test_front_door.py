@@ -342,19 +342,21 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
 
 
 def test_a_listing_is_aligned_text_and_escaped_html():
-    table = results.Table("A < B", ("state", "", "σ"), [("x", "rad", 1.5), ("long name", "", 12)], ["a note"], left=2)
+    rows = [("x", "rad", 1.5, "random"), ("long name", "", 12, "a")]
+    table = results.Table("A < B", ("state", "", "σ", "kind"), rows, ["a note"], left=2)
     assert table.text.splitlines() == [
         "A < B",
-        "state             σ",
-        "-------------------",
-        "x          rad  1.5",
-        "long name        12",
+        "state             σ  kind",
+        "---------------------------",
+        "x          rad  1.5  random",
+        "long name        12  a",
         "a note",
     ]
     html = xml.etree.ElementTree.fromstring(table.html)
     assert html.find("p/b").text == "A < B"
-    assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "long name", None, "12"]
-    assert [row.get("style") for row in html.iter("th")] == ["text-align:left"] * 2 + ["text-align:right"]
+    assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "random", "long name", None, "12", "a"]
+    sides = [row.get("style").removeprefix("text-align:") for row in html.iter("th")]
+    assert sides == ["left", "left", "right", "left"]
 
 
 @pytest.mark.parametrize(
