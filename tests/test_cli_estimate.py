@@ -81,7 +81,6 @@ def files(tmp_path_factory):
     write_record(folder / "spin.h5", simulate(spin, 3))
     without = setup.FilterSetup.for_scenario(spin, states=False)
     (folder / "filter.toml").write_text(setup.to_toml(without), encoding="utf-8")
-    (folder / "empty.csv").write_text("time,gx,gy,gz\n")
     hand = hand_held.simulated(1, 0, 12.0)
     columns = [hand.time + 0.005, hand.rate, hand.specific_force, hand.magnetic_field]
     header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
@@ -159,7 +158,6 @@ def test_a_lost_filter_says_that_it_recovered(succeeds, record, tmp_path):
         ("record.h5", ("--columns", "time=t"), "declares its own layout; leave --columns time=t out"),
         ("record.h5", ("--motion", "hand"), "--motion goes with a recording"),
         ("record.h5", ("--latency", 4.0), "--latency goes with a recording"),
-        ("record.h5", ("--calibration", "unit.toml"), "--calibration goes with a recording"),
         ("record.h5", ("--smooth", "--every", 2), "leave one of them out"),
         ("spin.h5", ("--state", "gyro.scael"), "did you mean 'gyro.scale'"),
         (
@@ -167,7 +165,6 @@ def test_a_lost_filter_says_that_it_recovered(succeeds, record, tmp_path):
             ("--filter", "filter.toml", "--states"),
             "--filter is the complete filter, with its noise and states; leave --states out",
         ),
-        ("empty.csv", ("--every", 2), "goes with a record"),
         ("none.csv", ("--every", 2), "none.csv does not exist"),
         ("hand.csv", ("--states",), "goes with a record"),
         ("hand.csv", ("--motion", "hnd"), "did you mean 'hand'?"),

@@ -11,14 +11,22 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
-from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers, options_given
+from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers
 from strapdown.files import write_json
 
 FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml", *FIGURES)
-"""Files that the command may write to its folder."""
-ABOUT_IT = ("estimate.html", "estimate.report.json")
-"""Files that other commands write there about an estimate."""
+REPORT = ("estimate.html", "estimate.report.json")
+FILES = (
+    "estimate.h5",
+    "errors.json",
+    "states.json",
+    "observability.json",
+    "field.json",
+    "calibration.toml",
+    *FIGURES,
+    *REPORT,
+)
+"""Files that this command, and `report`, may write to its folder."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +36,7 @@ class _Shared:
     gyro: Path | None = GYRO
     gate: float | None = Option(None, help="Reject measurements beyond this quantile of chi-squared, and recover.")
     robust: str | None = Option(None, help="Weight measurements by their innovations: huber or student.")
-    full_covariance: bool | None = Option(
-        None, "--full-covariance/--variances", help="Full covariances. Default: if there is a truth or a reference."
-    )
+    full_covariance: bool | None = Option(None, "--full-covariance/--variances", help="Default: full with a reference.")
     observability: bool = Option(False, "--observability", help="Report the observability of each state.")
     smooth: bool = Option(False, "--smooth", help="Also use the samples after each time (fixed-interval smoother).")
 
@@ -53,15 +59,13 @@ class _Recorded:
 
     motion: str | None = Option(
         None,
-        help="Motion model: hand (default), with bounded velocity; vehicle, with lasting acceleration; vessel, with bounded position; "
-        "or any, with white-noise acceleration.",
+        help="hand (default), of bounded velocity; vehicle: lasting acceleration; vessel: bounded position; or any.",
     )
     latency: float | None = Option(None, help="Delay of the gyro's samples, ms. Default: half a sample interval.")
     calibration: Path | None = Option(None, help="calibration.toml of the unit; a new one is written.")
     temperature: Path | None = Option(None, help="TOML of `strapdown allan --temperature`: bias to subtract.")
     place: str | None = Option(
-        None,
-        help="LATITUDE,LONGITUDE[,HEIGHT], degrees and m: use true North, and report samples unlike the field there.",
+        None, help="LATITUDE,LONGITUDE[,HEIGHT], ° and m: use true North, and report samples unlike the field there."
     )
     date: str | None = Option(None, help="Day of the recording, such as 2026-11-28, for --place.")
 
@@ -148,12 +152,10 @@ def estimate(
     ui.check_files(*(out / name for name in FILES), own="strapdown estimate")
     simulated = sd.recordings.is_record(recording)
     exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
-    for name in options_given(recorded if simulated else specified):
-        raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
     options, field = _options(shared, specified, recorded), recorded.field
     with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options)
-    if field is not None and source.magnetic_field is None:
+    if field is not None and getattr(source, "magnetic_field", None) is None:
         raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
     if not simulated:
         sd.ahrs.check_conventions.warn(source)
@@ -175,7 +177,7 @@ def estimate(
     contents = {file: part.summary() for file, part in parts.items()}
     if result.error_states:
         contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
-    for name in (*FILES[1:], *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
+    for name in FILES[1:]:  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
     paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():
