@@ -361,21 +361,6 @@ def test_the_detectable_error_of_a_bias_is_that_of_many_runs(satellite):
         assert low <= np.mean(rejected) <= high
 
 
-@pytest.mark.slow
-def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, succeeds, satellite, tmp_path):
-    status, said, _ = run("montecarlo", satellite, "--no-states", "--runs", 120, "--out", tmp_path / "plain.h5")
-    assert status == 1
-    assert "the filter has no state for the gyro's scale factor of 200 ppm" in said
-    plain = json.loads((tmp_path / "plain.json").read_text())
-    assert plain["nees"]["bias"]["anees"] > 1.5**2 * 0.8
-    status, said, _ = run("montecarlo", satellite, "--runs", 120, "--out", tmp_path / "states.h5")
-    assert "The filter has states for the specified errors, gyro.scale, gyro.drift" in said
-    assert "consistent: attitude, bias and innovations; detectable error of σ: " in said
-    assert status == 0
-    succeeds("montecarlo", tmp_path / "states.h5")
-    succeeds("check", tmp_path / "states.h5")
-
-
 def test_states_of_a_record_without_a_scenario_and_a_gate(succeeds, record, tmp_path):
     said = succeeds("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert "does not contain its scenario" in said

@@ -196,16 +196,6 @@ def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_pa
     np.testing.assert_array_equal(sd.estimate(again).attitude, sd.estimate(record).attitude)
 
 
-@pytest.mark.slow
-def test_states_are_those_of_the_scenarios_sensors_too():
-    faults = sd.vectors.Faults(correlated_sigma=1e-4, correlation_time=20.0)
-    first, second = scenario(20.0).sensors
-    disturbed = dataclasses.replace(scenario(20.0), sensors=(dataclasses.replace(first, faults=faults), second))
-    assert list(sd.estimate(sd.simulate(disturbed), states=True).error_states) == ["star 1 disturbance"]
-    assert list(sd.estimate(sd.simulate(disturbed)).error_states) == ["star 1 disturbance"]  # as the error is specified
-    assert not sd.estimate(sd.simulate(disturbed), states=False).error_states
-
-
 def test_a_cut_record_is_still_matched():
     """What a record was simulated from stays with it when it is cut or compressed."""
     record = sd.simulate(scenario(40.0))
@@ -266,29 +256,13 @@ def test_files_are_recognised_by_their_content(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"motion": "hand"}, "recording"),
-        ({"latency": 0.01}, "recording"),
-        ({"setup": sd.FilterSetup.for_scenario(scenario(1.0), states=False), "states": True}, "complete filter"),
-        ({"states": ["gyro.nothing"]}, "gyro.nothing"),
-        ({"gate": 1.5}, "1.5"),
-        ({"robust": "hubert"}, "hubert"),
-        ({"noise": 3.0}, "GyroSpec"),
-    ],
-)
-def test_options_that_do_not_go_together(options, words):
-    with pytest.raises(sd.InputError, match=words):
-        sd.estimate(sd.simulate(scenario(5.0)), **options)
-
-
-@pytest.mark.parametrize(
     "call",
     [
         lambda: sd.simulate(3),
         lambda: sd.monte_carlo(3.5),
         lambda: sd.estimate("record.h5"),
         lambda: sd.estimate(sd.simulate(scenario(5.0)), setup=3),
+        lambda: sd.estimate(sd.simulate(scenario(5.0)), noise=3.0),
         lambda: sd.tune("record.h5"),
         lambda: sd.tune([]),
         lambda: sd.integrate("record.h5"),
@@ -355,15 +329,9 @@ def test_a_listing_is_aligned_text_and_escaped_html():
     html = xml.etree.ElementTree.fromstring(table.html)
     assert html.find("p/b").text == "A < B"
     assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "random", "long name", None, "12", "a"]
+    assert [results.figure(x) for x in (0.00012345, None, math.nan, math.inf)] == ["0.0001234", "-", "-", "∞"]
     sides = [row.get("style").removeprefix("text-align:") for row in html.iter("th")]
     assert sides == ["left", "left", "right", "left"]
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.00012345, "0.0001234"), (None, "-"), (math.nan, "-"), (math.inf, "∞"), (-math.inf, "-∞")]
-)
-def test_figures(value, text):
-    assert results.figure(value) == text
 
 
 def test_an_estimate_prints_what_is_known_at_the_end():

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from measured import errors, turn_to
+from measured import turn_to
 
 import strapdown as sd
 from sims import campaign as sim
-from strapdown import coning, estimation, montecarlo, motion
+from strapdown import coning, montecarlo, motion
 from strapdown.checks import InputError
 from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo import FilterSetup, coning_study
@@ -103,28 +103,6 @@ def test_the_filter_is_consistent_from_large_errors_too():
     (statistics,) = montecarlo.run(scenario, (big,), runs=60, seed=6)
     verdict = statistics.verdict(np.arange(1, 100, 5), "attitude")
     assert verdict.consistent, verdict.mean
-
-
-def test_statistics_are_plain_sums():
-    """Against the runs taken one by one through estimation.run."""
-    from strapdown import consistency
-    from strapdown.records import compress
-    from strapdown.scenarios import simulate
-
-    statistics = montecarlo.run(SCENARIO, (setup(),), runs=3, seed=9)[0]
-    nees, square = 0.0, 0.0
-    for run in range(3):
-        record = simulate(SCENARIO, 9, run)
-        short = compress(record, coning.ALGORITHMS["matched-4-11"])
-        every = len(short.increments) // 100
-        result = estimation.run(
-            short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True
-        )
-        e = errors(result, short.truth, every)
-        nees = nees + consistency.nees(e, result.covariance)
-        square = square + e**2
-    assert np.allclose(statistics.anees[:, 0], nees / 18.0, rtol=1e-12)
-    assert np.allclose(statistics.rms_error, np.sqrt(square / 3.0), rtol=1e-12)
 
 
 def test_the_start_is_drawn_from_the_prior():

@@ -5,8 +5,6 @@ import multiprocessing
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -542,39 +540,3 @@ def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(com
     assert status == 3  # 4 runs cannot tell
     assert campaign.read("short-montecarlo.h5").finished
     assert signal.getsignal(number) is signal.SIG_IGN
-
-
-@pytest.mark.slow
-def test_the_installed_command_killed_again_and_again(tmp_path):
-    """Killed a while after it has begun to write, for how long it takes to start and to compile is no matter of the campaign."""
-    path = tmp_path / "spin-montecarlo.h5"
-    script = Path(sys.executable).with_name("strapdown")
-    arguments = [script, "montecarlo", "spin", "--machine", "scalar", "--chunk", "3", "--no-states"]
-    arguments += ["--resume", "--runs"]
-    few = subprocess.run([*arguments, "3"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)  # compiled
-    assert few.returncode in (1, 3)
-    random = np.random.default_rng(5)
-    kills = 0
-    for wait in random.uniform(0.0, 0.5, 10):
-        before = path.stat().st_mtime_ns
-        child = subprocess.Popen(
-            [*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        while child.poll() is None and path.stat().st_mtime_ns == before:
-            time.sleep(0.005)
-        try:
-            status = child.wait(timeout=wait)
-        except subprocess.TimeoutExpired:
-            child.send_signal(random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM]))
-            child.wait()
-            kills += campaign.read(path).statistics.runs < 600
-        else:
-            assert status == 1
-            break
-    assert kills >= 2
-    assert campaign.read(path).statistics.runs > 3  # what was killed had got somewhere
-    whole = subprocess.run([*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)
-    assert whole.returncode == 1  # the scale factor has no state
-    held = campaign.read(path)
-    assert held.finished
-    assert_same(held.statistics, montecarlo.run_plan(held.plan, runs=600, chunk=3, machine="scalar"))

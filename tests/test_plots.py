@@ -146,28 +146,6 @@ def test_a_line_of_an_angle_breaks_where_it_wraps(turns):
         assert jumps.mean() > 0.4
 
 
-def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
-    estimate, truth = run
-    innovations = next(iter(estimate.innovations.values()))
-    white = innovations.whitened
-    error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    size = np.linalg.norm(error[:, :3], axis=1)
-    for draw in (
-        lambda ax: plots.innovation_histogram(white, ax),
-        lambda ax: plots.innovation_autocorrelation(consistency.autocorrelation(white), ax),
-        lambda ax: plots.nis_over_record(innovations, consistency.mean_bounds(2, 1), ax),
-        lambda ax: plots.error_distribution(size, ax),
-        lambda ax: plots.coverage_by_state(statistics, -1, ax),
-        lambda ax: plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], (0, 4), ax),
-        lambda ax: plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias", ax),
-        lambda ax: plots.nis_over_time([("filter", statistics)], ax),
-    ):
-        _, ax = plots.new_figure()
-        assert draw(ax) is ax
-        assert ax.get_ylabel()
-    assert plots.nis_over_time([("filter", statistics)]) is not ax
-
-
 def test_a_distribution_has_its_quantiles_and_leaves_out_what_is_missing():
     ax = plots.error_distribution(np.array([3.0, np.nan, 1.0, 2.0, 4.0]) * units.DEGREE)
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1.0, 25.0], [2.0, 50.0], [3.0, 75.0], [4.0, 100.0]])
