@@ -237,10 +237,8 @@ class Statistics(ByValue, Listed):
         )
 
     def listing(self) -> Table:
-        """Return NEES and NIS per degree of freedom as a table, with the errors at the end as its notes."""
-        from strapdown.montecarlo import verdicts  # a layer above this one
-
-        tests, *_ = verdicts.tables(verdicts.summary(self))
+        """Return the evidence of the verdict as a table, with the errors at the end as its notes."""
+        evidence = self.judge().listing()
 
         def at_the_end(values: Array, axes: slice, unit: float) -> str:
             return ", ".join(figure(x) for x in (values[-1, axes] / unit).tolist())
@@ -255,7 +253,7 @@ class Statistics(ByValue, Listed):
         ]
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
-        return replace(tests, notes=(*tests.notes, *notes))
+        return replace(evidence, notes=(*evidence.notes, *notes))
 
     @property
     def has_bias(self) -> bool:
