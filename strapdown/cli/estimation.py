@@ -11,21 +11,12 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
-from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers
+from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers, options_given
 from strapdown.files import write_json
 
 FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
-REPORT = ("estimate.html", "estimate.report.json")
-FILES = (
-    "estimate.h5",
-    "errors.json",
-    "states.json",
-    "observability.json",
-    "field.json",
-    "calibration.toml",
-    *FIGURES,
-    *REPORT,
-)
+NUMBERS = tuple(f"{name}.json" for name in ("errors", "states", "observability", "field"))
+FILES = ("estimate.h5", "calibration.toml", *NUMBERS, *FIGURES, "estimate.html", "estimate.report.json")
 """Files that this command, and `report`, may write to its folder."""
 
 
@@ -36,7 +27,9 @@ class _Shared:
     gyro: Path | None = GYRO
     gate: float | None = Option(None, help="Reject measurements beyond this quantile of chi-squared, and recover.")
     robust: str | None = Option(None, help="Weight measurements by their innovations: huber or student.")
-    full_covariance: bool | None = Option(None, "--full-covariance/--variances", help="Default: full with a reference.")
+    full_covariance: bool | None = Option(
+        None, "--full-covariance/--variances", help="Full covariances. Default: if there is a truth or a reference."
+    )
     observability: bool = Option(False, "--observability", help="Report the observability of each state.")
     smooth: bool = Option(False, "--smooth", help="Also use the samples after each time (fixed-interval smoother).")
 
@@ -59,7 +52,8 @@ class _Recorded:
 
     motion: str | None = Option(
         None,
-        help="hand (default), of bounded velocity; vehicle: lasting acceleration; vessel: bounded position; or any.",
+        help="Motion model: hand (default), with bounded velocity; vehicle, with lasting acceleration; vessel, with bounded position; "
+        "or any, with white-noise acceleration.",
     )
     latency: float | None = Option(None, help="Delay of the gyro's samples, ms. Default: half a sample interval.")
     calibration: Path | None = Option(None, help="calibration.toml of the unit; a new one is written.")
@@ -152,10 +146,12 @@ def estimate(
     ui.check_files(*(out / name for name in FILES), own="strapdown estimate")
     simulated = sd.recordings.is_record(recording)
     exports = output.exports(recording, changed=bool(layout.axes or layout.invert), simulated=simulated)
+    for name in options_given(recorded if simulated else specified):
+        raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
     options, field = _options(shared, specified, recorded), recorded.field
     with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options)
-    if field is not None and getattr(source, "magnetic_field", None) is None:
+    if field is not None and source.magnetic_field is None:
         raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
     if not simulated:
         sd.ahrs.check_conventions.warn(source)

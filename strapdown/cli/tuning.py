@@ -43,7 +43,7 @@ class _Filter:
 
 @dataclass(frozen=True)
 class _Objective:
-    """Objective, by default the likelihood of all innovations, and search for its maximum."""
+    """Objective, by default the likelihood of all innovations, and the search."""
 
     truth: bool = Option(False, "--truth", help="Tune by the likelihood of the errors relative to the truth.")
     gate: bool = Option(False, "--gate", help="Also model outliers, and set the filter's gate.")
