@@ -17,7 +17,6 @@ import pytest
 
 import strapdown as sd
 from strapdown import results
-from strapdown.workflows import filters
 
 SHOWN = """FilterSetup Gate GyroSpec InputError LiveAhrs LiveFilter ProcessNoise Robust Scenario StepFilter VectorSensor accuracy
     allan_deviation calibrate check covariance_analysis diagnose estimate export fit_noise initial_state integrate monte_carlo read
@@ -298,22 +297,6 @@ def test_an_inverted_accelerometer_is_warned_of():
         UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*`invert='accelerometer'`"
     ):
         sd.estimate(walk)
-
-
-def test_considered_errors_are_in_the_units_of_a_data_sheet():
-    degree_per_hour, arcsecond = math.pi / 648_000.0, math.pi / 648_000.0
-    compass = sd.vectors.Magnetometer(name="m", field_f=[2e-5, 0.0, -4e-5], sigma=1e-7, rate=1.0)
-    sizes = {"scale_factor": 2.0, "misalignment": 2.0, "g_sensitivity": 2.0, "star 1.bias": 2.0, "m.bias": 2.0}
-    sizes |= {"star 1.mounting": 2.0, "star 1.delay": 2.0, "initial.attitude": 2.0, "initial.bias": 2.0}
-    arguments = filters.considered(sizes, (*scenario().sensors, compass))
-    errors = arguments["consider"]
-    assert (errors.scale_factor, errors.misalignment) == pytest.approx((2e-6, 2e-3))
-    assert errors.g_sensitivity == pytest.approx(2.0 * degree_per_hour / 9.80665)
-    assert errors.sensor_bias == pytest.approx({"star 1": 2.0 * arcsecond, "m": 2e-9})
-    assert errors.mounting == pytest.approx({"star 1": 2.0 * arcsecond})
-    assert errors.time_offset == pytest.approx({"star 1": 2e-3})
-    assert arguments["initial_attitude_sigma"] == pytest.approx(math.pi / 90.0)
-    assert arguments["initial_bias_sigma"] == pytest.approx(2.0 * degree_per_hour)
 
 
 def test_covariance_analysis_is_that_of_the_matched_filter():
