@@ -386,25 +386,12 @@ def test_the_command_resumes_extends_and_shows(command):
     assert "--seed" in error
 
 
-def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
-    status, said, error = command("short.toml", "--runs", 2, "--states", *SCALAR)
-    assert status == 3, error
-    assert "short: 2 runs, seed 1, machine: scalar." in said
-    held = campaign.read(tmp_path / "short-montecarlo.h5")
-    assert held.plan.individuals
-    assert held.plan.setup.states is not None
-    assert held.plan.setup.states.names == ("gyro.scale",)
-    (tmp_path / "any.toml").write_text(setups.to_toml(held.plan.setup), encoding="utf-8")
-    status, _, error = command("short.toml", "--runs", 2, "--states", "--filter", "any.toml")
-    assert status == 2
-    assert "--filter is the complete filter, with its noise and states; leave --states out" in error
-
-
 def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(command):
     """Scale factors over the runs: independent standard normals times that of the specification, whatever the chunks."""
-    command("short.toml", "--runs", 4, *SCALAR)
+    command("short.toml", "--runs", 4, "--states", *SCALAR)
     plan = campaign.read("short-montecarlo.h5").plan
     assert plan.individuals
+    assert plan.setup.states.names == ("gyro.scale",)
     known = replace(SCENARIO.gyro, scale_factor=np.zeros(3))
     exact = replace(plan, scenario=replace(plan.scenario, gyro=known))
     ratio = []
