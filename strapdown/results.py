@@ -11,6 +11,7 @@ import base64
 import dataclasses
 import io
 import math
+import re
 import textwrap
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,9 @@ __all__ = ["ByValue", "Column", "Listed", "Table", "equal", "figure"]
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
 
+
+_NUMBER = re.compile(r"[-+−±×<>≤≥ ]*[\d∞]|-$")
+"""Begin of a cell with a number, or a missing one."""
 
 Value = str | float | int | bool | None
 """Content of a cell; None and NaN are empty."""
@@ -53,7 +57,7 @@ class Table:
     """One value for each column."""
     notes: Sequence[str] = ()
     left: int = 1
-    """Number of leading columns with text, in text; the others contain numbers."""
+    """Number of leading columns that are at the left also if they hold numbers."""
     name: str = ""
     """Name of its files without suffix."""
 
@@ -93,18 +97,23 @@ class Table:
         return {"title": self.title, "columns": self.head, "rows": self.cells, "notes": notes, "left": self.left}
 
     @property
-    def text(self) -> str:
-        """The table as lines of text."""
-        cells = [self.head, *self.cells]
+    def sides(self) -> list[str]:
+        """Side of each column in text: words are at the left, and numbers after the first columns at the right."""
+        columns = list(zip(*self.cells, strict=True)) or [()] * len(self.head)
+        return ["right" if k >= self.left and any(map(_NUMBER.match, c)) else "left" for k, c in enumerate(columns)]
+
+    @property
+    def lines(self) -> list[str]:
+        """Heading, rule and rows as lines of text; none without rows."""
+        cells, marks = [self.head, *self.cells], ["<" if side == "left" else ">" for side in self.sides]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = [
-            "  ".join(
-                f"{cell:{'<' if k < self.left else '>'}{width}}"
-                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-            )
-            for row in cells
-        ]
-        table = [lines[0], "-" * len(lines[0]), *lines[1:]] if self.rows else []
+        layout = "  ".join(f"{{:{mark}{width}}}" for mark, width in zip(marks, widths, strict=True))
+        lines = [layout.format(*row).rstrip() for row in cells]
+        return [lines[0], "-" * max(map(len, lines)), *lines[1:]] if self.rows else []
+
+    @property
+    def text(self) -> str:
+        """The table with title and notes as text."""
         title = textwrap.wrap(self.title, WIDTH) or [""]
         notes = [
             part
@@ -112,18 +121,15 @@ class Table:
             for line in note.splitlines()
             for part in textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False)
         ]
-        return "\n".join(line.rstrip() for line in (*title, *table, *notes))
+        return "\n".join(line.rstrip() for line in (*title, *self.lines, *notes))
 
     @property
     def html(self) -> str:
         """The table as HTML, for notebooks."""
 
         def row(cells: Sequence[str], tag: str) -> str:
-            sides = ("left" if k < self.left else "right" for k in range(len(cells)))
-            return "".join(
-                f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
-                for side, cell in zip(sides, cells, strict=True)
-            )
+            parts = zip(self.sides, cells, strict=True)
+            return "".join(f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>' for side, cell in parts)
 
         body = "".join(f"<tr>{row(cells, 'td')}</tr>" for cells in self.cells)
         table = f"<table><thead><tr>{row(self.head, 'th')}</tr></thead><tbody>{body}</tbody></table>"

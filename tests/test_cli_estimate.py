@@ -2,11 +2,11 @@
 
 import dataclasses
 import json
+import shutil
 
 import h5py
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import strapdown as sd
 from sims import hand_held
@@ -69,11 +69,33 @@ def specified(record):
     return dataclasses.replace(record, origin=records.Origin(gyro=SPEC, seed=4, run=0))
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Records: of stars, of one star, without a specification, of a spinning body; and a hand as CSV, its samples 5 ms late."""
+    folder = tmp_path_factory.mktemp("records")
+    write_record(folder / "record.h5", specified(simulate(scenario_of(), 4)))
+    alone = simulate(scenario_of(STARS[:1]), 4)
+    write_record(folder / "alone.h5", specified(alone))
+    write_record(folder / "bare.h5", ImuRecord(time=alone.time, increments=alone.increments, vectors=alone.vectors))
+    spin = scenarios.load_scenario("spin")
+    write_record(folder / "spin.h5", simulate(spin, 3))
+    without = setup.FilterSetup.for_scenario(spin, states=False)
+    (folder / "filter.toml").write_text(setup.to_toml(without), encoding="utf-8")
+    hand = hand_held.simulated(1, 0, 12.0)
+    columns = [hand.time + 0.005, hand.rate, hand.specific_force, hand.magnetic_field]
+    header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
+    np.savetxt(folder / "hand.csv", np.column_stack(columns), delimiter=",", header=header, comments="")
+    return folder
+
+
 @pytest.fixture
-def record(tmp_path):
-    path = tmp_path / "record.h5"
-    write_record(path, specified(simulate(scenario_of(), 4)))
-    return path
+def record(files):
+    return files / "record.h5"
+
+
+@pytest.fixture
+def spinning(files):
+    return files / "spin.h5"
 
 
 def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds, record, tmp_path):
@@ -122,30 +144,39 @@ def test_a_lost_filter_says_that_it_recovered(succeeds, record, tmp_path):
     assert "rejected by the gate" in said
 
 
-def test_what_a_record_does_not_hold_is_asked_for(refusal, record, tmp_path):
-    bare = tmp_path / "bare.h5"
-    whole = simulate(scenario_of(STARS[:1]), 4)
-    write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
-    (tmp_path / "own.csv").write_text("time,gx,gy,gz\n")
-    cases = (
-        ((bare,), "give the gyro's noise, --gyro, or a filter, --filter"),
-        ((record, "--attitude", "1,0,0"), "w,x,y,z"),
-        ((record, "--attitude", "1,0,0,0", "--from-truth"), "give one of them"),
-        ((record, "--robust", "hubert"), "did you mean 'huber'"),
-        ((record, "--gate", 1.5), "between 0 and 1"),
-        ((record, "--time-unit", "ms"), "declares its own layout; leave --time-unit ms out"),
-        ((record, "--columns", "time=t"), "declares its own layout; leave --columns time=t out"),
-        ((tmp_path / "own.csv", "--every", 2), "goes with a record"),
-        ((tmp_path / "none.csv", "--every", 2), "none.csv does not exist"),
-    )
-    for arguments, words in cases:
-        error = refusal("estimate", *arguments, "--out", tmp_path / "out")
-        assert words in error
-    alone = tmp_path / "alone.h5"
-    write_record(alone, specified(whole))
-    error = refusal("estimate", alone, "--out", tmp_path / "out")
-    assert "two directions are needed" in error
-    assert "--from-truth" in error
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("bare.h5", (), "give the gyro's noise, --gyro, or a filter, --filter"),
+        ("alone.h5", (), "two directions are needed"),
+        ("alone.h5", (), "--from-truth"),
+        ("record.h5", ("--attitude", "1,0,0"), "w,x,y,z"),
+        ("record.h5", ("--attitude", "1,0,0,0", "--from-truth"), "give one of them"),
+        ("record.h5", ("--robust", "hubert"), "did you mean 'huber'"),
+        ("record.h5", ("--gate", 1.5), "between 0 and 1"),
+        ("record.h5", ("--time-unit", "ms"), "declares its own layout; leave --time-unit ms out"),
+        ("record.h5", ("--columns", "time=t"), "declares its own layout; leave --columns time=t out"),
+        ("record.h5", ("--motion", "hand"), "--motion goes with a recording"),
+        ("record.h5", ("--latency", 4.0), "--latency goes with a recording"),
+        ("record.h5", ("--smooth", "--every", 2), "leave one of them out"),
+        ("spin.h5", ("--state", "gyro.scael"), "did you mean 'gyro.scale'"),
+        (
+            "spin.h5",
+            ("--filter", "filter.toml", "--states"),
+            "--filter is the complete filter, with its noise and states; leave --states out",
+        ),
+        ("none.csv", ("--every", 2), "none.csv does not exist"),
+        ("hand.csv", ("--states",), "goes with a record"),
+        ("hand.csv", ("--motion", "hnd"), "did you mean 'hand'?"),
+        ("hand.csv", ("--latency", -1.0), "--latency is -1 ms"),
+        ("hand.csv", ("--latency", "nan"), "--latency is nan"),
+        ("hand.csv", ("--latency", 60000.0), "lasts"),
+        ("hand.csv", ("--calibration", "none.toml"), "none.toml does not exist"),
+    ],
+)
+def test_what_does_not_go_together_or_is_missing_is_refused(refusal, files, tmp_path, name, options, words):
+    shutil.copy(files / "filter.toml", tmp_path)
+    assert words in refusal("estimate", files / name, "--out", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
 
 
@@ -191,57 +222,47 @@ def test_faults_do_not_hide_that_a_start_is_missing():
 # ---------------------------------------------------------------------------------------------------- optional states, one direction
 
 
-@pytest.fixture
-def spinning(tmp_path):
-    scenario = scenarios.load_scenario("spin")
-    path = tmp_path / "spin.h5"
-    write_record(path, simulate(scenario, 3))
-    return path
-
-
-@pytest.mark.draws
-def test_states_that_the_errors_call_for(run, succeeds, spinning, tmp_path, monkeypatch, blank):
-    status, said, error = run(
-        "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"
-    )
+def test_states_that_the_errors_call_for(run, succeeds, spinning, tmp_path):
+    options = ("--states", "--from-truth", "--every", 100, "--figures")
+    status, said, error = run("estimate", spinning, "--out", tmp_path / "out", *options)
     assert (status, error) == (0, "")
     assert "Optional states: gyro.scale." in said
     assert "ppm" in said
     assert "Still without" not in said
-    states = json.loads((tmp_path / "out" / "states.json").read_text())
-    assert states["gyro scale"]["components"] == ["z"]
-    assert states["gyro scale"]["first_sigma"] == pytest.approx([1e-4])
-    assert states["gyro scale"]["sigma"][0] < 0.7e-4
-    kept = read_estimate(tmp_path / "out" / "estimate.h5").error_states["gyro scale"]
-    assert kept.components == ("z",)
-    assert kept.units == ("1",)
-    assert len(kept.values) == len(read_estimate(tmp_path / "out" / "estimate.h5").time)
-    np.testing.assert_allclose(
-        [kept.values[-1], kept.sigma[-1]], [[*states["gyro scale"][n]] for n in ("values", "sigma")]
-    )
-    assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
+    assert (tmp_path / "out" / "states.png").exists()
+    states = json.loads((tmp_path / "out" / "states.json").read_text())["gyro scale"]
+    assert states["components"] == ["z"]
+    assert states["first_sigma"] == pytest.approx([1e-4])
+    assert states["sigma"][0] < 0.7e-4
+    estimate = read_estimate(tmp_path / "out" / "estimate.h5")
+    kept = estimate.error_states["gyro scale"]
+    assert (kept.components, kept.units, len(kept.values)) == (("z",), ("1",), len(estimate.time))
+    np.testing.assert_allclose([kept.values[-1], kept.sigma[-1]], [states["values"], states["sigma"]])
     saved = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
-    assert saved == setup.FilterSetup.for_record(simulate(scenarios.load_scenario("spin"), 3), states=True)
-    assert sd.check(sd.read(tmp_path / "out" / "estimate.h5")).verdict == "cannot tell"  # of the bias
-    monkeypatch.setattr(Figure, "savefig", blank)
-    succeeds("report", tmp_path / "out" / "estimate.h5")
+    assert saved == setup.FilterSetup.for_record(read_record(spinning), states=True)
+    assert sd.check(estimate).verdict == "cannot tell"  # of the bias
     (tmp_path / "filter.toml").write_text(setup.to_toml(saved))
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 100)
     succeeds("estimate", spinning, "--out", tmp_path / "again", *options)
-    estimate, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("out", "again"))
+    other = read_estimate(tmp_path / "again" / "estimate.h5")
     assert np.array_equal(estimate.attitude, other.attitude)
     assert np.array_equal(estimate.covariance, other.covariance)
 
 
-def test_what_a_record_shows_of_each_state(succeeds, spinning, tmp_path):
-    said = succeeds("estimate", spinning, "--out", tmp_path / "out", "--observability", "--states")
+def test_what_a_record_shows_of_each_state(succeeds, record, tmp_path):
+    said = succeeds("estimate", record, "--out", tmp_path / "out", "--observability")
     assert "directions are observed" in said
     saved = json.loads((tmp_path / "out" / "observability.json").read_text())
     names = [state["state"] for state in saved["states"]]
-    assert len(names) == len(saved["directions"]) >= 7
+    assert len(names) == len(saved["directions"]) == 6
     assert saved["rank"] == sum(direction["singular_value"] >= saved["threshold"] for direction in saved["directions"])
-    assert {state["unit"] for state in saved["states"][:6]} == {"rad", "rad/s"}
+    assert {state["unit"] for state in saved["states"]} == {"rad", "rad/s"}
     assert set(saved["directions"][0]["one_sigma_left"]) == set(names)
+    # The next estimate replaces all of this one and nothing else.
+    (tmp_path / "out" / "estimate.html").write_text("a report of the first estimate")
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    succeeds("estimate", record, "--out", tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.h5", "errors.json", "notes.txt"}
 
 
 def test_what_the_filter_has_no_state_for_is_reported(spinning, record):
@@ -340,21 +361,6 @@ def test_the_detectable_error_of_a_bias_is_that_of_many_runs(satellite):
         assert low <= np.mean(rejected) <= high
 
 
-@pytest.mark.slow
-def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, succeeds, satellite, tmp_path):
-    status, said, _ = run("montecarlo", satellite, "--no-states", "--runs", 120, "--out", tmp_path / "plain.h5")
-    assert status == 1
-    assert "the filter has no state for the gyro's scale factor of 200 ppm" in said
-    plain = json.loads((tmp_path / "plain.json").read_text())
-    assert plain["nees"]["bias"]["anees"] > 1.5**2 * 0.8
-    status, said, _ = run("montecarlo", satellite, "--runs", 120, "--out", tmp_path / "states.h5")
-    assert "The filter has states for the specified errors, gyro.scale, gyro.drift" in said
-    assert "consistent: attitude, bias and innovations; detectable error of σ: " in said
-    assert status == 0
-    succeeds("montecarlo", tmp_path / "states.h5")
-    succeeds("check", tmp_path / "states.h5")
-
-
 def test_states_of_a_record_without_a_scenario_and_a_gate(succeeds, record, tmp_path):
     said = succeeds("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert "does not contain its scenario" in said
@@ -362,40 +368,10 @@ def test_states_of_a_record_without_a_scenario_and_a_gate(succeeds, record, tmp_
     assert not (tmp_path / "out" / "states.json").exists()
 
 
-def test_states_are_refused_where_they_make_no_sense(refusal, spinning, tmp_path):
-    (tmp_path / "filter.toml").write_text(
-        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=False))
-    )
-    (tmp_path / "rec.csv").write_text("")
-    cases = (
-        ((spinning, "--state", "gyro.scael"), "did you mean 'gyro.scale'"),
-        (
-            (spinning, "--filter", tmp_path / "filter.toml", "--states"),
-            "--filter is the complete filter, with its noise and states; leave --states out",
-        ),
-        ((tmp_path / "rec.csv", "--states"), "goes with a record"),
-    )
-    for arguments, words in cases:
-        error = refusal("estimate", *arguments, "--out", tmp_path / "out")
-        assert words in error
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(succeeds, refusal, record, tmp_path):
-    out = tmp_path / "out"
-    succeeds("estimate", record, "--observability", "--out", out)
-    left = (out / "observability.json", out / "estimate.html")
-    left[1].write_text("a report of the first estimate")
-    (out / "notes.txt").write_text("mine")
-    assert left[0].exists()
-    succeeds("estimate", record, "--out", out)
-    assert not left[0].exists()
-    assert not left[1].exists()
-    assert (out / "notes.txt").read_text() == "mine"
-    (out / "estimate.h5").write_text("mine too")
-    error = refusal("estimate", record, "--out", out)
-    assert "was not written by `strapdown estimate`" in error
-    assert (out / "estimate.h5").read_text() == "mine too"
+def test_a_file_of_someone_else_is_not_replaced(refusal, record, tmp_path):
+    (tmp_path / "estimate.h5").write_text("mine")
+    assert "was not written by `strapdown estimate`" in refusal("estimate", record, "--out", tmp_path)
+    assert (tmp_path / "estimate.h5").read_text() == "mine"
 
 
 def test_directions_that_contradict_each_other_start_nothing(refusal, tmp_path):
@@ -464,32 +440,12 @@ def test_states_of_a_direction_are_printed_relative_to_its_vector(record):
     ]
 
 
-def test_smoothing_with_states_holds_them(succeeds, tmp_path):
-    path = tmp_path / "record.h5"
-    scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
-    write_record(path, simulate(scenario, 2))
-    succeeds("estimate", path, "--out", tmp_path / "out", "--smooth", "--state", "gyro.scale")
-    assert "gyro scale" in json.loads((tmp_path / "out" / "states.json").read_text())
-
-
 # ---------------------------------------------------------------------------------------------------- a recording of a hand
 
 
 @pytest.fixture
-def recording(tmp_path):
-    """A simulated hand as CSV, its samples 5 ms late."""
-    samples = hand_held.simulated(1, 0, 12.0)
-    samples = dataclasses.replace(samples, time=samples.time + 0.005)
-    path = tmp_path / "hand.csv"
-    header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
-    np.savetxt(
-        path,
-        np.column_stack([samples.time, samples.rate, samples.specific_force, samples.magnetic_field]),
-        delimiter=",",
-        header=header,
-        comments="",
-    )
-    return path
+def recording(files):
+    return files / "hand.csv"
 
 
 def off(folder, shift):
@@ -536,16 +492,18 @@ def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
         assert ("Samples are assumed to be stamped 5 ms late." in said) == (name == "later")
         assert ("Motion: any" in said) == (name == "any")
     assert errors["smoothed"] < errors["hand"] < errors["any"]
+    assert "gyro scale" in json.loads((tmp_path / "smoothed" / "states.json").read_text())
     assert abs(errors["later"] - errors["hand"]) < 0.3
 
 
 def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recording, tmp_path):
-    recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
-    said = succeeds("estimate", recording, "--out", tmp_path / "out")
+    wrong = tmp_path / "hand.csv"
+    wrong.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
+    said = succeeds("estimate", wrong, "--out", tmp_path / "out")
     words = "warning: hand.csv: probably gyro rates are 57.3 times too small (rad/s read as deg/s; --gyro-unit rad/s); specific force is "
     assert words in said
     # Which then ends for want of the parameter.
-    assert words in run("tune", recording, "--free", "nothing", "--out", tmp_path / "filter.toml")[1]
+    assert words in run("tune", wrong, "--free", "nothing", "--out", tmp_path / "filter.toml")[1]
     assert "See `strapdown doctor`, with the same file and its options." in said
 
 
@@ -577,51 +535,11 @@ def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
     assert np.abs(second.gyro_matrix - first.gyro_matrix).max() < 2e-3
 
 
-def test_a_clipped_gyro_is_reported(succeeds, recording, tmp_path):
+def test_a_clipped_gyro_and_a_hand_that_never_rests_are_reported(succeeds, recording, tmp_path):
     header, *rows = recording.read_text().splitlines()
-    values = np.loadtxt(rows, delimiter=",")
+    values = np.loadtxt(rows[799:], delimiter=",")  # after the rest
     values[:, 1] = np.clip(values[:, 1], -1.2, 1.2)
-    np.savetxt(recording, values, delimiter=",", header=header, comments="")
-    said = succeeds("estimate", recording, "--out", tmp_path / "out")
+    np.savetxt(tmp_path / "moving.csv", values, delimiter=",", header=header, comments="")
+    said = succeeds("estimate", tmp_path / "moving.csv", "--out", tmp_path / "out")
     assert "The gyro was clipped: x at 68.75 °/s" in said
-
-
-def test_a_hand_that_never_rests_is_reported(succeeds, recording, tmp_path):
-    lines = recording.read_text().splitlines()
-    moving = tmp_path / "moving.csv"
-    moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")
-    said = succeeds("estimate", moving, "--out", tmp_path / "out")
     assert "No second is quiet enough to measure the gyro's bias, so the heading may drift at first." in said
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--motion", "hnd"), "did you mean 'hand'?"),
-        (("--latency", -1.0), "--latency is -1 ms"),
-        (("--latency", "nan"), "--latency is nan"),
-        (("--latency", 60000.0), "lasts"),
-        (("--gate", 1.5), "between 0 and 1"),
-        (("--robust", "hubert"), "did you mean 'huber'"),
-        (("--states",), "goes with a record"),
-        (("--calibration", "none.toml"), "none.toml does not exist"),
-    ],
-)
-def test_bad_options_of_a_recording_are_refused(refusal, recording, tmp_path, options, words):
-    error = refusal("estimate", recording, "--out", tmp_path / "out", *options)
-    assert words in error, error
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--motion", "hand"), "--motion goes with a recording"),
-        (("--latency", 4.0), "--latency goes with a recording"),
-        (("--calibration", "unit.toml"), "--calibration goes with a recording"),
-        (("--smooth", "--every", 2), "leave one of them out"),
-    ],
-)
-def test_options_of_a_recording_are_refused_with_a_record(refusal, record, tmp_path, options, words):
-    error = refusal("estimate", record, "--out", tmp_path / "out", *options)
-    assert words in error, error

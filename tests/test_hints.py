@@ -1,6 +1,5 @@
 """Library text names the arguments of Python; only the command line names options."""
 
-import ast
 import functools
 import re
 from pathlib import Path
@@ -24,39 +23,22 @@ def options() -> set[str]:
 
 
 @functools.cache
-def outside_of_the_command_line():
-    """Texts, and calls of functions by their names: (file, node)."""
-    return [
-        (path.relative_to(PACKAGE), node)
-        for path in sorted(PACKAGE.rglob("*.py"))
-        if "cli" not in path.relative_to(PACKAGE).parts
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Constant | ast.Call)
-    ]
+def library() -> dict[str, str]:
+    """The sources outside of the command line by their paths."""
+    paths = (path for path in PACKAGE.rglob("*.py") if "cli" not in path.relative_to(PACKAGE).parts)
+    return {str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8") for path in paths}
 
 
 def test_no_text_of_the_library_names_an_option():
-    known = options()
-    named = [
-        f"{path}:{node.lineno}: {flag}"
-        for path, node in outside_of_the_command_line()
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-        for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*", node.value)
-        if flag in known
-    ]
-    assert not named
+    flags = {(path, flag) for path, text in library().items() for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)}
+    assert {(path, flag) for path, flag in flags if flag in options()} == set()
 
 
 def test_every_hint_has_an_option():
-    calls = [
-        node
-        for _, node in outside_of_the_command_line()
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Hint"
-    ]
-    shown = [option(Hint(node.args[0].value)) for node in calls if isinstance(node.args[0], ast.Constant)]
-    known = options() | {"--units"}  # one option for each unit
-    assert len(shown) > 20
-    assert {flag for text in shown for flag in text.split(" or ")} <= known
+    arguments = {name for text in library().values() for name in re.findall(r"\bHint\([\"'](\w+)[\"']", text)}
+    assert len(arguments) > 15
+    shown = {flag for name in arguments for flag in option(Hint(name)).split(" or ")}
+    assert shown <= options() | {"--units"}  # one option for each unit
 
 
 @pytest.mark.parametrize(

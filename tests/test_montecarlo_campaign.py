@@ -5,8 +5,6 @@ import multiprocessing
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -55,36 +53,26 @@ def one_by_one(order, stop_after):
 # ------------------------------------------------------------------------------------------------------------ the file
 
 
-def test_the_file_holds_what_a_plain_run_gives(tmp_path):
-    path = tmp_path / "deeper" / "c.h5"
-    reported = []
+@pytest.fixture(scope="module")
+def of_21_runs(tmp_path_factory):
+    path, reported = tmp_path_factory.mktemp("campaign") / "deeper" / "c.h5", []
     result = go(path, 21, progress=reported.append)
     assert result.finished
     assert sum(reported) == 21
-    assert_same(result.statistics, straight(21))
-    held = campaign.read(path)
-    assert_same(held.statistics, result.statistics)
+    return path
+
+
+def test_the_file_holds_what_a_plain_run_gives_and_describes_itself(of_21_runs):
+    held = campaign.read(of_21_runs)
+    assert_same(held.statistics, straight(21))
     assert held.plan.digest == PLAN.digest
     assert (held.machine, held.chunk, held.runs, held.finished) == ("scalar", CHUNK, 21, True)
-    assert list(tmp_path.rglob("*")) == [path.parent, path]
-
-
-def test_a_campaign_runs_in_any_thread(tmp_path):
-    """Only the main thread may handle signals."""
-    with ThreadPoolExecutor(1) as pool:
-        result = pool.submit(go, tmp_path / "c.h5", 4).result()
-    assert_same(result.statistics, straight(4))
-
-
-def test_the_file_describes_itself(tmp_path):
-    path = tmp_path / "c.h5"
-    go(path, 21)
-    with reading.hdf5(path) as file:
+    assert list(of_21_runs.parent.iterdir()) == [of_21_runs]
+    with reading.hdf5(of_21_runs) as file:
         attributes = reading.attributes(file)
         assert attributes["kind"] == "strapdown montecarlo"
-        assert (
-            scenarios.scenario_to_toml(scenarios.scenario_from_toml(attributes["scenario"])) == attributes["scenario"]
-        )
+        again = scenarios.scenario_from_toml(attributes["scenario"])
+        assert scenarios.scenario_to_toml(again) == attributes["scenario"]
         assert "[filter]" in attributes["filter"]
         assert attributes["finished_runs"] == 21
         assert {"python", "numpy", "numba", "h5py"} == set(json.loads(attributes["versions"]))
@@ -95,41 +83,40 @@ def test_the_file_describes_itself(tmp_path):
         assert set(file["statistics"]) == names
 
 
-@pytest.mark.parametrize("end", [8, 13])
-def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path, end):
-    """From ends on whole chunks and on short ones, of which only the short one is computed again."""
-    path, computed = tmp_path / "c.h5", []
+def test_a_campaign_runs_in_any_thread(tmp_path):
+    """Only the main thread may handle signals."""
+    with ThreadPoolExecutor(1) as pool:
+        result = pool.submit(go, tmp_path / "c.h5", 4).result()
+    assert_same(result.statistics, straight(4))
+
+
+def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path):
+    """From ends on whole chunks and on short ones, of which only the short one is computed again; at its end nothing is."""
+    path, computed, reported = tmp_path / "c.h5", [], []
 
     def noting(work, chunks):
         computed.extend(chunks)
         return engine.in_threads(1)(work, computed)
 
     go(path, 5)
-    go(path, end, resume=True, chunk=None)
+    for end in (8, 13):
+        go(path, end, resume=True, chunk=None)
     result = go(path, 30, resume=True, workers=noting)
     assert computed == list(engine.chunks_of(30, CHUNK))[1:]
     assert_same(result.statistics, straight(30))
     assert_same(campaign.read(path).statistics, straight(30))
 
-
-def test_resuming_a_finished_campaign_computes_nothing(tmp_path):
-    path = tmp_path / "c.h5"
-    first = go(path, 21)
-    reported = []
-
     def idle(work, chunks):
         assert not chunks
         return iter(())
 
-    again = go(path, 21, resume=True, workers=idle, progress=reported.append)
-    assert reported == [21]
-    assert_same(first.statistics, again.statistics)
-    assert again.seconds >= first.seconds
+    again = go(path, 30, resume=True, workers=idle, progress=reported.append)
+    assert reported == [30]
+    assert_same(result.statistics, again.statistics)
+    assert again.seconds >= result.seconds
 
 
-@pytest.mark.parametrize(
-    ("order", "stop"), [([0, 1, 2, 3], 2), ([3, 1, 2, 0], 1), ([3, 1, 2, 0], 3), ([2, 0, 3, 1], 2)]
-)
+@pytest.mark.parametrize(("order", "stop"), [([3, 1, 2, 0], 3), ([2, 0, 3, 1], 2)])
 def test_finished_chunks_are_never_computed_again(tmp_path, order, stop):
     """Interrupted with chunks finished in any order: the file has all of them, resuming computes the others alone."""
     path = tmp_path / "c.h5"
@@ -165,7 +152,7 @@ def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
 
     monkeypatch.setattr(campaign, "_write", slow)
     begun = time.perf_counter()
-    go(tmp_path / "c.h5", 160, chunk=2)
+    go(tmp_path / "c.h5", 60, chunk=2)
     elapsed = time.perf_counter() - begun
     assert 2 <= len(written) <= 3 + elapsed / 0.5
     assert campaign.read(tmp_path / "c.h5").finished
@@ -174,7 +161,7 @@ def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
 # ------------------------------------------------------------------------------------------------------------ killed
 
 
-def _child(path, runs, die_at):
+def _child(path, runs, chunk, die_at):
     """Run a campaign in a forked process; with ``die_at`` it kills itself in the middle of writing its n-th dataset."""
     if die_at:
         written = [0]
@@ -194,12 +181,12 @@ def _child(path, runs, die_at):
         return original_chunks(*arguments)
 
     scalar.run_chunks = unhurried
-    go(path, runs, resume=True, threads=1)
+    go(path, runs, resume=True, chunk=chunk, threads=1)
 
 
-def _killed(path, runs, *, after=None, die_at=0):
+def _killed(path, runs, *, chunk=CHUNK, after=None, die_at=0):
     """Start such a process, kill it after so many seconds if it has not finished; return whether it was killed."""
-    child = multiprocessing.get_context("fork").Process(target=_child, args=(path, runs, die_at))
+    child = multiprocessing.get_context("fork").Process(target=_child, args=(path, runs, chunk, die_at))
     child.start()
     child.join(after)
     if child.is_alive():
@@ -212,28 +199,28 @@ def _killed(path, runs, *, after=None, die_at=0):
 def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
     scalar.run_chunk(PLAN, 0, 1)  # compiled before the children fork
     path = tmp_path / "c.h5"
-    runs, kills, total, folds = 80, 0, None, {}
-    for first, number in engine.chunks_of(runs, CHUNK):
+    runs, chunk, kills, total, folds = 40, 4, 0, None, {}
+    for first, number in engine.chunks_of(runs, chunk):
         part = scalar.run_chunk(PLAN, first, number)
         total = part if total is None else statistics.merge(total, part)
         folds[total.runs] = total
     random = np.random.default_rng(8)
     for _ in range(10):
-        if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
+        if not _killed(path, runs, chunk=chunk, after=random.uniform(0.02, 0.15)):
             break
         kills += 1
         if path.exists():
             held = campaign.read(path)  # whole at every moment
             if held.statistics is not None:
                 assert_same(held.statistics, folds[held.statistics.runs])
-    _killed(path, runs)
+    _killed(path, runs, chunk=chunk)
     assert kills >= 2
     assert_same(campaign.read(path).statistics, total)
     assert [p.name for p in tmp_path.iterdir()] == ["c.h5"]  # nothing of the killed ones is left
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("die_at", [1, 18, 31])
+@pytest.mark.parametrize("die_at", [18, 31])
 def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, die_at):
     scalar.run_chunk(PLAN, 0, 1)
     path = tmp_path / "c.h5"
@@ -247,18 +234,6 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
 
 
 # ------------------------------------------------------------------------------------------------------------ refused
-
-
-def _forged(path, name, value):
-    with changed(path) as file:
-        file.attrs[name] = value
-
-
-@pytest.fixture(scope="module")
-def of_21_runs(tmp_path_factory):
-    path = tmp_path_factory.mktemp("campaign") / "c.h5"
-    go(path, 21)
-    return path
 
 
 @pytest.mark.parametrize(
@@ -289,19 +264,18 @@ def test_a_file_of_another_campaign_is_refused_and_left_as_it_is(of_21_runs, cha
     assert path.read_bytes() == before
 
 
-def test_a_file_of_another_version_or_format_is_refused(tmp_path):
+def test_a_file_of_another_version_or_format_is_refused(of_21_runs, tmp_path):
     path = tmp_path / "c.h5"
-    go(path, 8)
-    _forged(path, "version", "0.0.1")
-    with pytest.raises(InputError, match=r"version is 0\.0\.1 there"):
-        go(path, 16, resume=True)
-    go(path, 8, overwrite=True)
-    _forged(path, "arithmetic", "another processor")  # which rounds differently
-    with pytest.raises(InputError, match="arithmetic is another processor there"):
-        go(path, 16, resume=True)
-    _forged(path, "format", 99)
-    with pytest.raises(InputError, match="format 99, newer"):
-        campaign.read(path)
+    for name, value, message in (
+        ("version", "0.0.1", r"version is 0\.0\.1 there"),
+        ("arithmetic", "another processor", "arithmetic is another processor there"),  # which rounds differently
+        ("format", 99, "format 99, newer"),
+    ):
+        path.write_bytes(of_21_runs.read_bytes())
+        with changed(path) as file:
+            file.attrs[name] = value
+        with pytest.raises(InputError, match=message):
+            go(path, 30, resume=True)
 
 
 def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
@@ -313,15 +287,13 @@ def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
     with pytest.raises(InputError, match="cannot be read as HDF5"):
         go(path, 8, resume=True)
     assert path.read_text() == "the only copy of my thesis"
-    assert go(path, 8, overwrite=True).finished
+    assert go(path, 2, overwrite=True).finished
 
 
-def test_files_that_are_no_campaign_are_refused(tmp_path):
-    path = tmp_path / "c.h5"
+def test_files_that_are_no_campaign_are_refused(of_21_runs, tmp_path):
+    path, whole = tmp_path / "c.h5", of_21_runs.read_bytes()
     with pytest.raises(InputError, match="does not exist"):
         campaign.read(path)
-    go(path, 8)
-    whole = path.read_bytes()
     for share in (0.1, 0.5, 0.99):
         path.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(InputError, match="truncated"):
@@ -364,7 +336,6 @@ def test_the_command_computes_prints_and_writes(command):
         "NIS sun sensor",
         "NIS star",
         "Worst runs",
-        "runs/s",
         "cannot tell: ",
     ):
         assert words in " ".join(said.split())
@@ -385,7 +356,9 @@ def test_the_command_matches_the_filter_to_a_data_sheet(command):
     Path("other.toml").write_text(Path("short.toml").read_text(), encoding="utf-8")
     sheet = "[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.9\nrate_random_walk_deg_per_hour_per_sqrt_hour = 6.0\n"
     Path("gyro.toml").write_text(sheet, encoding="utf-8")
-    assert command("other.toml", "--runs", 4, "--no-states", "--gyro", "gyro.toml", *SCALAR)[0] in (1, 3)
+    status, said, _ = command("other.toml", "--runs", 4, "--no-states", "--gyro", "gyro.toml", *SCALAR)
+    assert status in (1, 3)
+    assert "--states adds states for most of these errors" in said
     plan = campaign.read("other-montecarlo.h5").plan
     assert plan.scenario.gyro == SCENARIO.gyro
     assert plan.setup.process_noise.angle_random_walk == pytest.approx(0.9 * np.pi / 10800.0)
@@ -397,41 +370,28 @@ def test_the_command_matches_the_filter_to_a_data_sheet(command):
 
 
 def test_the_command_resumes_extends_and_shows(command):
-    assert command("short.toml", "--runs", 20, *SCALAR)[0] == 3
-    status, _, error = command("short.toml", "--runs", 20, *SCALAR)
+    assert command("short.toml", "--runs", 4, *SCALAR)[0] == 3
+    status, _, error = command("short.toml", "--runs", 4, *SCALAR)
     assert status == 2
     assert "--resume" in error
     assert "--overwrite" in error
-    assert command("short.toml", "--runs", 30, "--resume", *SCALAR)[0] == 3
+    assert command("short.toml", "--runs", 6, "--resume", *SCALAR)[0] == 3
     status, said, _ = command("short-montecarlo.h5")
     assert status == 3
-    assert "30 runs" in said
-    assert command("short-montecarlo.h5", "--runs", 35, "--resume")[0] == 3
-    assert campaign.read("short-montecarlo.h5").statistics.runs == 35
+    assert "6 runs" in said
+    assert command("short-montecarlo.h5", "--runs", 8, "--resume")[0] == 3
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 8
     status, _, error = command("short-montecarlo.h5", "--seed", 3, "--resume")
     assert status == 2
     assert "--seed" in error
 
 
-def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
-    status, said, error = command("short.toml", "--runs", 2, "--states", *SCALAR)
-    assert status == 3, error
-    assert "short: 2 runs, seed 1, machine: scalar." in said
-    held = campaign.read(tmp_path / "short-montecarlo.h5")
-    assert held.plan.individuals
-    assert held.plan.setup.states is not None
-    assert held.plan.setup.states.names == ("gyro.scale",)
-    (tmp_path / "any.toml").write_text(setups.to_toml(held.plan.setup), encoding="utf-8")
-    status, _, error = command("short.toml", "--runs", 2, "--states", "--filter", "any.toml")
-    assert status == 2
-    assert "--filter is the complete filter, with its noise and states; leave --states out" in error
-
-
 def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(command):
     """Scale factors over the runs: independent standard normals times that of the specification, whatever the chunks."""
-    command("short.toml", "--runs", 4, *SCALAR)
+    command("short.toml", "--runs", 4, "--states", *SCALAR)
     plan = campaign.read("short-montecarlo.h5").plan
     assert plan.individuals
+    assert plan.setup.states.names == ("gyro.scale",)
     known = replace(SCENARIO.gyro, scale_factor=np.zeros(3))
     exact = replace(plan, scenario=replace(plan.scenario, gyro=known))
     ratio = []
@@ -448,7 +408,7 @@ def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(
 def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
     Path("f.toml").write_text(setups.to_toml(replace(SETUP, measurement_sigma_factor=0.5)))
     Path("d.toml").write_text("[dispersions]\nattitude_error_deg = [0.0, 0.0, 5.0]\nattitude_sigma_deg = 0.0\n")
-    status, said, _ = command("short.toml", "--runs", 40, "--filter", "f.toml", "--dispersions", "d.toml", *SCALAR)
+    status, said, _ = command("short.toml", "--runs", 12, "--filter", "f.toml", "--dispersions", "d.toml", *SCALAR)
     assert status == 1
     assert "not consistent: the filter is" in said
     held = campaign.read("short-montecarlo.h5")
@@ -458,7 +418,7 @@ def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
 
 @pytest.mark.parametrize("machine", ["scalar", pytest.param("lanes", marks=pytest.mark.slow)])
 def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
-    assert command("short.toml", "--runs", 12, "--machine", machine)[0] in (1, 3)
+    assert command("short.toml", "--runs", 6, "--machine", machine)[0] in (1, 3)
     held = campaign.read("short-montecarlo.h5")
     status, said, _ = command("short-montecarlo.h5", "--replay", 5)
     assert status == 0
@@ -565,43 +525,7 @@ def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(com
 
     signal.signal(number, signal.SIG_IGN)
     monkeypatch.setattr(campaign, "_write", interrupted)
-    status, _, _ = command("short.toml", "--runs", 20, "--threads", 1, *SCALAR)
-    assert status == 3  # 20 runs cannot tell
+    status, _, _ = command("short.toml", "--runs", 4, "--threads", 1, *SCALAR)
+    assert status == 3  # 4 runs cannot tell
     assert campaign.read("short-montecarlo.h5").finished
     assert signal.getsignal(number) is signal.SIG_IGN
-
-
-@pytest.mark.slow
-def test_the_installed_command_killed_again_and_again(tmp_path):
-    """Killed a while after it has begun to write, for how long it takes to start and to compile is no matter of the campaign."""
-    path = tmp_path / "spin-montecarlo.h5"
-    script = Path(sys.executable).with_name("strapdown")
-    arguments = [script, "montecarlo", "spin", "--machine", "scalar", "--chunk", "3", "--no-states"]
-    arguments += ["--resume", "--runs"]
-    few = subprocess.run([*arguments, "3"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)  # compiled
-    assert few.returncode in (1, 3)
-    random = np.random.default_rng(5)
-    kills = 0
-    for wait in random.uniform(0.0, 0.5, 10):
-        before = path.stat().st_mtime_ns
-        child = subprocess.Popen(
-            [*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        while child.poll() is None and path.stat().st_mtime_ns == before:
-            time.sleep(0.005)
-        try:
-            status = child.wait(timeout=wait)
-        except subprocess.TimeoutExpired:
-            child.send_signal(random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM]))
-            child.wait()
-            kills += campaign.read(path).statistics.runs < 600
-        else:
-            assert status == 1
-            break
-    assert kills >= 2
-    assert campaign.read(path).statistics.runs > 3  # what was killed had got somewhere
-    whole = subprocess.run([*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)
-    assert whole.returncode == 1  # the scale factor has no state
-    held = campaign.read(path)
-    assert held.finished
-    assert_same(held.statistics, montecarlo.run_plan(held.plan, runs=600, chunk=3, machine="scalar"))

@@ -175,11 +175,6 @@ def test_worst_runs_are_the_largest_and_of_equal_ones_the_first():
     assert run.tolist() == [3, 9]
 
 
-def test_statistics_of_different_plans_are_not_merged():
-    with pytest.raises(InputError, match="different time"):
-        montecarlo.merge(scalar.run_chunk(PLAN, 0, 1), scalar.run_chunk(planned(epochs=3), 0, 1))
-
-
 def test_a_run_that_fails_is_counted_reported_and_left_out(monkeypatch):
     """One run of five turns to NaN half way: sums go on without it, the verdict does not."""
     original = setups.run
@@ -233,20 +228,6 @@ def test_measurements_that_a_gate_refuses_are_counted_apart(monkeypatch):
     assert total.sensor_refused.tolist() == [[0, 0, 0, 0, 0], [0, 0, 0, 0, 3]]
     assert total.sensor_nis_sum[1].sum() == 0.0
     assert np.array_equal(total.sensor_nis_sum[0], plain.sensor_nis_sum[0])
-
-
-def test_summary_of_a_right_filter_and_of_a_wrong_one():
-    perfect = replace(SCENARIO, gyro=replace(SCENARIO.gyro, scale_factor=np.zeros(3)))
-    right = montecarlo.run_plan(planned(scenario=perfect), runs=200, machine="scalar")
-    summary = montecarlo.summary(right)
-    assert summary["consistent"]
-    assert [part["sensor"] for part in summary["nis"]] == ["sun sensor", "star"]
-    for share, expected in zip(summary["coverage"]["attitude"], summary["coverage"]["expected"], strict=True):
-        assert abs(share - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / 200)  # 3 axes, correlated epochs
-    wrong = montecarlo.run_plan(
-        planned(scenario=perfect, setup=replace(SETUP, measurement_sigma_factor=0.5)), runs=50, machine="scalar"
-    )
-    assert not montecarlo.summary(wrong)["consistent"]
 
 
 def test_summary_bounds_are_those_that_decide():
@@ -390,23 +371,30 @@ def test_every_part_of_a_plan_counts_in_its_digest():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("call", "message"),
     [
-        ({"epochs": 7}, "multiple of 7"),
-        ({"epochs": 0}, "epochs is 0"),
-        ({"seed": -1}, "seed is -1"),
+        (lambda: planned(epochs=7), "multiple of 7"),
+        (lambda: planned(epochs=0), "epochs is 0"),
+        (lambda: planned(seed=-1), "seed is -1"),
+        (lambda: montecarlo.run_plan(PLAN, runs=0), "runs is 0"),
+        (lambda: montecarlo.run_plan(PLAN, runs=1.5), "runs is 1.5"),
+        (lambda: montecarlo.run_plan(PLAN, runs=1, chunk=0), "chunk is 0"),
+        (lambda: montecarlo.run_plan(PLAN, runs=1, threads=0), "threads is 0"),
+        (lambda: montecarlo.run_plan(PLAN, runs=1, machine="lane"), "did you mean 'lanes'"),
+        (lambda: montecarlo.Dispersions(scale_factor_sigma=-1.0), "scale_factor_sigma is -1"),
+        (lambda: montecarlo.read_dispersions("none.toml"), "does not exist"),
+        (
+            lambda: montecarlo.merge(scalar.run_chunk(PLAN, 0, 1), scalar.run_chunk(planned(epochs=3), 0, 1)),
+            "different time",
+        ),
     ],
 )
-def test_bad_plans_are_refused(changes, message):
+def test_what_is_wrong_is_refused(call, message):
     with pytest.raises(InputError, match=message):
-        planned(**changes)
+        call()
 
 
-def test_bad_dispersions_are_refused(tmp_path):
-    with pytest.raises(InputError, match="scale_factor_sigma is -1"):
-        montecarlo.Dispersions(scale_factor_sigma=-1.0)
-    with pytest.raises(InputError, match="does not exist"):
-        montecarlo.read_dispersions(tmp_path / "none.toml")
+def test_dispersions_of_a_file(tmp_path):
     path = tmp_path / "d.toml"
     path.write_text("[dispersion]\n")
     with pytest.raises(InputError, match=r"no table \[dispersions\]"):
@@ -461,11 +449,13 @@ def test_initial_errors_are_as_dispersed():
     dispersions = montecarlo.Dispersions(
         attitude_sigma=0.0, bias_sigma=1e-3, attitude_error=np.array([0.3, -0.2, 0.1]), bias_error=np.full(3, 5e-3)
     )
-    total = montecarlo.run_plan(planned(dispersions=dispersions), runs=200, machine="scalar")
+    total = scalar.run_chunk(planned(dispersions=dispersions), 0, 2)
     assert np.allclose(total.mean_error[0, :3], dispersions.attitude_error, atol=1e-12)
-    assert np.all(np.abs(total.mean_error[0, 3:] - 5e-3) < 4.0 * 1e-3 / np.sqrt(200))
-    spread = np.diagonal(total.mean_square_error[0])[3:] - total.mean_error[0, 3:] ** 2
-    assert np.all(np.abs(spread / 1e-6 - 1.0) < 4.5 * np.sqrt(2.0 / 200))
+    record = scenarios.simulate(SCENARIO, PLAN.seed, 0)
+    starts = [montecarlo.start(record, SETUP, PLAN.seed, run, dispersions) for run in range(200)]
+    error = record.truth.bias[0] - np.array([start.bias for start in starts])
+    assert np.all(np.abs(error.mean(axis=0) - 5e-3) < 4.0 * 1e-3 / np.sqrt(200))
+    assert np.all(np.abs(error.var(axis=0) / 1e-6 - 1.0) < 4.5 * np.sqrt(2.0 / 200))
 
 
 # ------------------------------------------------------------------------------------------------------------ engine
@@ -476,15 +466,15 @@ COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_r
 @pytest.mark.parametrize(
     ("machine", "others"),
     [
-        ("scalar", [(8, 2), (8, 5), (7, 2), (1000, 2)]),
+        ("scalar", [(8, 2), (8, 5), (7, 2)]),
         pytest.param("lanes", [(1, 2), (7, 1), (8, 2), (1000, 2)], marks=pytest.mark.slow),
     ],
 )
 def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size_on_any_number_of_threads(machine, others):
     """Every run counts, and the worst and the first ones in all their bits; in chunks of the same size all sums too."""
-    reference = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine=machine)
+    reference = montecarlo.run_plan(PLAN, runs=36, chunk=8, threads=1, machine=machine)
     for chunk, threads in others:
-        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine=machine)
+        other = montecarlo.run_plan(PLAN, runs=36, chunk=chunk, threads=threads, machine=machine)
         assert not different(reference, other, COUNTED if chunk != 8 else None)
         assert np.allclose(reference.nees_sum, other.nees_sum, rtol=1e-12)
 
@@ -509,7 +499,7 @@ def test_memory_does_not_grow_with_the_runs():
         return most
 
     peak(4)
-    assert (peak(60) - peak(20)) / 20 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
+    assert (peak(32) - peak(12)) / 10 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
 
 
 def test_chunks_are_not_listed():
@@ -581,21 +571,6 @@ def test_nobody_waits_for_a_running_chunk_when_stopped():
     assert time.monotonic() - stopped < 5.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"runs": 0}, "runs is 0"),
-        ({"runs": 1.5}, "runs is 1.5"),
-        ({"runs": 1, "chunk": 0}, "chunk is 0"),
-        ({"runs": 1, "threads": 0}, "threads is 0"),
-        ({"runs": 1, "machine": "lane"}, "did you mean 'lanes'"),
-    ],
-)
-def test_bad_numbers_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        montecarlo.run_plan(PLAN, **options)
-
-
 def test_the_machine_is_chosen_by_the_plan_and_reported():
     rough = planned(scenario=replace(SCENARIO, gyro=replace(SCENARIO.gyro, quantization=1e-6)))
     choice = montecarlo.choose(rough)
@@ -607,20 +582,6 @@ def test_the_machine_is_chosen_by_the_plan_and_reported():
 
 
 # ------------------------------------------------------------------------------------------------------------ replay
-
-
-@pytest.mark.parametrize("machine", ["scalar", "lanes"])
-def test_the_examples_are_the_first_runs_by_their_numbers(machine):
-    """Chunks begin and end among them."""
-    total = montecarlo.run_plan(PLAN, runs=12, chunk=5, threads=1, machine=machine)
-    assert total.example_run.tolist() == list(range(statistics.EXAMPLES))
-
-
-def test_degrees_of_freedom_are_those_of_the_states_judged():
-    total = scalar.run_chunk(PLAN, 0, 8)
-    epochs = np.array([2, 4])
-    degrees = {name: total.verdict(epochs, name).degrees for name in total.subsets}
-    assert degrees == {"state": 6, "attitude": 3, "bias": 3}
 
 
 def test_lost_samples_and_jitter_go_through_too():

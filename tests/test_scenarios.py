@@ -232,6 +232,7 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
             ("rate_hz = 1.0", "rate_hz = 1.0\noutlier_probability = 2"),
             r"\(two.toml: sensors\[0\]: outlier_probability = 2\)",
         ),
+        (('name = "star 1"', 'name = " "'), "two.toml: a sensor has no name"),
         (('name = "star 1"', 'name = "star 2"'), r"two.toml: two sensors are named 'star 2'"),
         (("[gyro]", '[gyro]\npreset = "mpu"'), r"two.toml: gyro: preset 'mpu' is not known; did you mean 'mpu-9250'\?"),
     ],
@@ -254,19 +255,10 @@ def test_a_byte_order_mark_is_no_matter(tmp_path):
 
 
 def test_lists_of_numbers_stand_on_one_line():
-    for name in scenarios.SCENARIOS:
+    for name in ("hand-held", "ship", "cubesat"):
         scenario = load_scenario(name)
-        text = scenario_to_toml(scenario)
-        assert tomllib.loads(text) == scenario_to_table(scenario)
+        assert tomllib.loads(scenario_to_toml(scenario)) == scenario_to_table(scenario)
     assert "rate_deg_per_s = [0.1, -0.2, 0.5]\n" in scenario_to_toml(load_scenario("two-stars"))
-
-
-@pytest.mark.parametrize("name", ["", " "])
-def test_a_sensor_has_a_name(name):
-    scenario = load_scenario("two-stars")
-    sensors = (dataclasses.replace(scenario.sensors[0], name=name), *scenario.sensors[1:])
-    with pytest.raises(InputError, match="no name"):
-        dataclasses.replace(scenario, sensors=sensors)
 
 
 def test_one_scale_factor_for_all_axes_and_any_boresight_go_through_a_file():

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from strapdown import cli
 from strapdown.checks import InputError
-from strapdown.report.tables import to_csv, to_latex, write
+from strapdown.report import page
+from strapdown.report.tables import to_csv, to_latex
 from strapdown.results import Column, Table
 
 FEW = ("--free", "star 1.sigma", "--starts", 1)
@@ -94,10 +95,6 @@ def test_latex_rounds_and_aligns():
     assert body[1][1] == "$-62.39$"
 
 
-DRAWN = ("allan", "covariance")
-"""One command for each format; of the other commands only the names of the figures are looked at."""
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Each command once, with --tables, and --format where it draws: its folder by the command's name."""
@@ -121,8 +118,7 @@ def written(tmp_path_factory):
     for name, options in commands.items():
         tables = [] if name in ("simulate", "estimate") else ["--tables", where / "tables" / name]
         with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
-            if name not in DRAWN:
-                patch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, **options: Path(path).touch())
+            patch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, **options: Path(path).touch())
             if name == "coning":
                 warnings.simplefilter("error")  # a study as short as can be warns of nothing
             result = CliRunner().invoke(cli.app, [str(part) for part in [name, *options, *tables]])
@@ -147,19 +143,14 @@ WANTED = {
 @pytest.mark.parametrize("name", WANTED)
 def test_every_study_writes_its_tables(written, name):
     folder = written / "tables" / name
-    assert {path.name for path in folder.iterdir()} == {
-        f"{table}.{end}" for table in WANTED[name] for end in ("csv", "tex")
-    }
+    files = {f"{table}.{end}" for table in WANTED[name] for end in ("csv", "tex")}
+    assert {path.name for path in folder.iterdir()} == files
     for table in WANTED[name]:
         head, rows = read_back((folder / f"{table}.csv").read_text(encoding="utf-8"))
         assert rows
         columns, shown, body = tabular((folder / f"{table}.tex").read_text(encoding="utf-8"))
         assert len(head) == len(columns) == len(shown)
         assert [len(row) for row in body] == [len(columns)] * len(rows)
-
-
-def test_coning_json_has_exactly_the_keys_of_issue_a_where_no_algorithm_is_ones_own(written):
-    assert set(json.loads((written / "coning" / "coning.json").read_text())) == {"scenario", "integration", "filter"}
 
 
 def of(written, name, table):
@@ -169,6 +160,7 @@ def of(written, name, table):
 
 def test_tables_hold_the_numbers_of_the_json(written):
     study = json.loads((written / "coning" / "coning.json").read_text())
+    assert set(study) == {"scenario", "integration", "filter"}  # no "own" without an algorithm of one's own
     for row, algorithm in zip(of(written, "coning", "drift"), study["integration"], strict=True):
         assert float(row["drift_deg_per_hour"]) == algorithm["drift_deg_per_hour"]
     for row, algorithm in zip(of(written, "coning", "filters"), study["filter"], strict=True):
@@ -199,14 +191,10 @@ def test_figures_are_written_in_the_format_asked_for(written):
     svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood", "filter-heldout"}
     pdf = {"covariance/budget", "estimate/estimate", "estimate/errors"}
     assert figures == {*(f"{x}.svg" for x in svg), *(f"{x}.pdf" for x in pdf)}
-    assert (written / "allan" / "allan.svg").read_bytes().startswith(b"<?xml")
-    assert (written / "covariance" / "budget.pdf").read_bytes().startswith(b"%PDF-")
 
 
-def test_a_report_shows_svg_and_names_pdf(written, tmp_path):
-    from strapdown.report import page
-
-    shutil.copy(written / "allan" / "allan.svg", tmp_path / "errors.svg")
+def test_a_report_shows_svg_and_names_pdf(tmp_path):
+    (tmp_path / "errors.svg").write_text("<?xml version='1.0'?><svg/>")
     assert "data:image/svg+xml;base64," in page.stored_figure(tmp_path / "errors", "errors")
     (tmp_path / "errors.pdf").write_bytes(b"%PDF-")
     content = page.stored_figure(tmp_path / "errors", "errors")
@@ -238,16 +226,8 @@ def test_the_tables_compile(written, tmp_path):
     assert (tmp_path / "all.pdf").exists()
 
 
-def test_a_folder_is_made_and_files_appear_whole(tmp_path):
-    table = keyed(["a"], [[1.0]])
-    assert write([table], tmp_path / "new" / "folder") == [
-        tmp_path / "new" / "folder" / f"t.{end}" for end in ("csv", "tex")
-    ]
-    assert sorted(path.name for path in (tmp_path / "new" / "folder").iterdir()) == ["t.csv", "t.tex"]
-
-
-@pytest.mark.parametrize("name", ["=HYPERLINK(1)", "+1", "-2", "@x", "\tx"])
-def test_text_of_a_csv_is_no_formula(name):
+def test_text_of_a_csv_is_no_formula():
     """A name of a sensor may come from a scenario of someone else."""
-    table = keyed(("sensor", "value"), [(name, -1.5)])
-    assert read_back(to_csv(table))[1] == [[f"'{name}", "-1.5"]]
+    names = ["=HYPERLINK(1)", "+1", "-2", "@x", "\tx"]
+    rows = read_back(to_csv(keyed(("sensor", "value"), [(name, -1.5) for name in names])))[1]
+    assert rows == [[f"'{name}", "-1.5"] for name in names]

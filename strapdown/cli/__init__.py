@@ -3,10 +3,7 @@
 A result replaces an earlier result of the same name completely. ``estimate``, ``simulate``, ``integrate`` and ``tune`` never replace a file
 that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
-- ``terminal``: Functions shared by all commands.
-- ``options``: Options of several commands.
-
-The other modules define the commands that :data:`COMMANDS` assigns to them.
+``terminal`` and ``options`` have what several commands share; the other modules define those that :data:`COMMANDS` assigns to them.
 """
 
 from __future__ import annotations
@@ -42,11 +39,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "Recordings": {
         "doctor": ("recordings", "walk.csv --gyro-unit deg/s --accelerometer-unit g"),
-        "calibrate": (
-            "recordings",
-            "turned.csv --gyro-unit deg/s --accelerometer-unit g",
-            "slow.h5 fast.h5 --out calibration.toml",
-        ),
+        "calibrate": ("recordings", "slow.csv fast.csv --gyro-unit deg/s --accelerometer-unit g"),
         "convert": ("recordings", "walk.bag walk.csv"),
     },
     "Integration of the gyro": {
@@ -99,10 +92,6 @@ def _say(usual: Callable[..., None], message: Warning | str, category: type[Warn
         errors.print(f"warning: {message}", soft_wrap=True)
 
 
-FAULT = 70
-"""Exit status of an internal error of the program (EX_SOFTWARE of BSD)."""
-
-
 def main() -> None:
     """Run the command line; bad input ends with one line and status 2, Ctrl-C with 130, an internal error with 70."""
     warnings.showwarning = functools.partial(_say, warnings.showwarning)
@@ -130,7 +119,7 @@ def main() -> None:
 
         traceback.print_exc()
         status, words = (
-            FAULT,
+            70,  # EX_SOFTWARE of BSD
             f"internal error of strapdown {strapdown.__version__} ({type(error).__name__}), not a verdict and not bad input; please report "
             "the traceback above with the command",
         )

@@ -22,11 +22,7 @@ class _Identification:
     sensor: list[str] | None = Option(None, help="gyro (default), accelerometer or magnetometer; may be repeated.")
     rate: float | None = Option(None, help="Sample rate of an NPY file, Hz.")
     highest_frequency: float | None = Option(None, help="Maximum frequency of the fit, Hz.")
-    temperature: int | None = Option(
-        None,
-        metavar="ORDER",
-        help="Subtract a polynomial of the recorded temperature, of this order, and identify the rest.",
-    )
+    temperature: int | None = Option(None, metavar="ORDER", help="Subtract a polynomial of the recorded temperature.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +62,17 @@ def allan(
         count("--temperature", options.temperature)
     kalibr = {"factor": output.factor, "topic": samples.topic or "/imu0"}
     exports = {}
-    for name, wanted, to, more in (
-        ("imu.yaml", output.kalibr, sd.allan.parameters.to_kalibr, kalibr),
-        ("px4.params", output.px4, sd.allan.parameters.to_px4, {}),
-        ("imu_sensor.m", output.matlab, sd.allan.parameters.to_matlab, {}),
+    for name, wanted, to in (
+        ("imu.yaml", output.kalibr, partial(sd.allan.parameters.to_kalibr, **kalibr)),
+        ("px4.params", output.px4, sd.allan.parameters.to_px4),
+        ("imu_sensor.m", output.matlab, sd.allan.parameters.to_matlab),
     ):
         if wanted:
-            exports[output.out / name] = partial(to, source=recording.name, **more)
+            exports[output.out / name] = to
     ui.check_files(*(file for sensor in sensors for file in output.files(sensor)), *exports)
     fits = {sensor: _identified(recording, sensor, samples, options, output) for sensor in sensors}
     for file, text in exports.items():
-        write_text(file, text(fits))
+        write_text(file, text(fits, source=recording.name))
     ui.written(*exports)
     if output.kalibr:
         ui.say(f"imu.yaml has the maximum over the axes times {output.factor:g} (--factor).")

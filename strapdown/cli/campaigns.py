@@ -19,24 +19,14 @@ if TYPE_CHECKING:
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
 
-_SUFFIXES = (".h5", ".hdf5")
-
 
 @dataclass(frozen=True)
 class _Model:
     """Filter and errors; a campaign file contains its own."""
 
-    filter_file: Path | None = Option(
-        None,
-        "--filter",
-        help="TOML with a table named filter, as of `strapdown tune`; or FILE.py:NAME, your own filter, which is executed. Default: a "
-        "matched one.",
-    )
+    filter_file: Path | None = Option(None, "--filter", help="TOML, or FILE.py:NAME, your own, which is executed.")
     gyro: Path | None = GYRO
-    dispersions: Path | None = Option(
-        None,
-        help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
-    )
+    dispersions: Path | None = Option(None, help="TOML with a table named dispersions: what differs from run to run.")
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
     states: bool | None = STATES
 
@@ -52,8 +42,8 @@ class _Computing:
     workers: int | None = Option(None, help="Number of processes to use instead of threads (needs Dask).")
     cluster: str | None = Option(
         None,
-        help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
-        "and workers can run any code in your account (they send pickles): connect only to one that you trust.",
+        help="Compute on the Dask scheduler at this address, tcp://HOST:8786 or tls://. Scheduler and workers can run any code in your "
+        "account: connect only to one that you trust.",
     )
     resume: bool = Option(False, "--resume", help="Continue with the file if it exists.")
     overwrite: bool = Option(False, "--overwrite", help="Start from the beginning even if the file exists.")
@@ -69,6 +59,8 @@ def montecarlo(
     replay: int | None = Option(None, help="Repeat this run and write its record and estimate."),
 ) -> dict[str, Any] | None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
+    from strapdown.montecarlo import verdicts
+
     source = Path(scenario)
     held, plan = _planned(source, scenario, model)
     if held is not None and computing.machine == "auto":
@@ -79,14 +71,16 @@ def montecarlo(
         raise InputError("--resume and --overwrite exclude each other; give one of them")
     if beside.exists() and not target.exists() and not computing.overwrite and replay is None:
         raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    ui.check_files(target, suffixes=_SUFFIXES, reads=False)
+    ui.check_files(target, suffixes=ui.HDF5, reads=False)
     ui.check_files(beside)
     if replay is not None:
         _replay(plan, replay, computing.machine, target)
         return None
     new = held is None or target != source or computing.resume or computing.overwrite
     result = _computed(plan, target, source.stem, computing) if new else held
-    content = _shown(result)
+    content = result.summary()
+    ui.show(*verdicts.tables(content))
+    ui.say("Use --replay to examine a run.", *result.words)
     if new:
         write_json(beside, content)
         ui.written(target, beside)
@@ -107,7 +101,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Any, Plan]:
     if place is not None and own:
         ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
         setup = read_filter(place)
-    if source.suffix.lower() in _SUFFIXES:
+    if source.suffix.lower() in ui.HDF5:
         held = campaigns.read(source)
         if own:
             held, model = campaigns.with_filter(held, setup, source), replace(model, filter_file=None)
@@ -156,27 +150,6 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
             raise
 
 
-def _shown(campaign: Campaign) -> dict[str, Any]:
-    """Print the statistics and the verdict of `strapdown check`; return the content of the JSON file."""
-    from strapdown.estimation.setup import MEKF
-    from strapdown.montecarlo.verdicts import tables
-
-    judgement, content, seconds = sd.check(campaign), campaign.summary(), campaign.seconds
-    ui.show(*tables(content))
-    rate = f" ({ui.rate_text(content['runs'] / seconds)} runs/s, including compilation)" if seconds > 0.0 else ""
-    ui.say(
-        "Use --replay to examine a run.",
-        f"{campaign.extent}, {seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} statistics of `strapdown check`: a "
-        f"consistent filter passes with {100.0 * judgement.confidence_level:g} %.",
-        judgement.words,
-    )
-    if judgement.verdict == "cannot tell":
-        ui.say("More runs (--runs, with --resume) are needed for a decision.")
-    if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
-        ui.say("--states adds states for most of these errors to the filter.")
-    return content
-
-
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     """Repeat a run, and write its record and its estimate."""
     paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
@@ -186,7 +159,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     sd.write(again.estimate, paths[1])
     nees, worst = again.largest_nees(plan.time)
     ui.say(
-        f"Run {run} of seed {plan.seed}, machine: {sd.montecarlo.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of "
-        f"the campaign is {nees:.1f} ({'six' if again.estimate.has_bias else 'three'} states), at {worst:g} s."
+        f"Run {run} of seed {plan.seed}, machine: {sd.montecarlo.choose(plan, machine)}. Its maximum NEES of the states at the "
+        f"{plan.epochs} epochs of the campaign is {nees:.1f}, at {worst:g} s."
     )
     ui.written(*paths)

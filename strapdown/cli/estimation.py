@@ -15,10 +15,9 @@ from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, 
 from strapdown.files import write_json
 
 FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml", *FIGURES)
-"""Files that the command may write to its folder."""
-ABOUT_IT = ("estimate.html", "estimate.report.json")
-"""Files that other commands write there about an estimate."""
+NUMBERS = tuple(f"{name}.json" for name in ("errors", "states", "observability", "field"))
+FILES = ("estimate.h5", "calibration.toml", *NUMBERS, *FIGURES, "estimate.html", "estimate.report.json")
+"""Files that this command, and `report`, may write to its folder."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ class _Recorded:
     calibration: Path | None = Option(None, help="calibration.toml of the unit; a new one is written.")
     temperature: Path | None = Option(None, help="TOML of `strapdown allan --temperature`: bias to subtract.")
     place: str | None = Option(
-        None,
-        help="LATITUDE,LONGITUDE[,HEIGHT], degrees and m: use true North, and report samples unlike the field there.",
+        None, help="LATITUDE,LONGITUDE[,HEIGHT], ° and m: use true North, and report samples unlike the field there."
     )
     date: str | None = Option(None, help="Day of the recording, such as 2026-11-28, for --place.")
 
@@ -175,7 +173,7 @@ def estimate(
     contents = {file: part.summary() for file, part in parts.items()}
     if result.error_states:
         contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
-    for name in (*FILES[1:], *ABOUT_IT):  # of an earlier estimate; this one may not write all of them
+    for name in FILES[1:]:  # of an earlier estimate; this one may not write all of them
         (out / name).unlink(missing_ok=True)
     paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():

@@ -13,13 +13,8 @@ from strapdown.cli import terminal as ui
 
 @ui.command()
 def export(
-    filter_file: str = Argument(
-        metavar="FILTER",
-        help="TOML file of a filter setup; or a motion (hand, vehicle, vessel, any): the filter of `strapdown estimate` for an IMU.",
-    ),
-    sensors: str | None = Argument(
-        None, help="Simulated record or scenario (name or TOML file) whose sensors the filter of a setup uses."
-    ),
+    filter_file: str = Argument(metavar="FILTER", help="TOML; or hand, vehicle, vessel, any: that of `estimate`."),
+    sensors: str | None = Argument(None, help="Simulated record, or scenario, with the sensors of a TOML's filter."),
     rate: float | None = Option(None, help="Sample rate of the IMU, Hz."),
     magnetometer: bool = Option(False, "--magnetometer", help="The IMU has a magnetometer."),
     to: Literal["c", "js"] = Option("c", "--to", help="Language: C99, or JavaScript (an ES module)."),
@@ -32,8 +27,7 @@ def export(
         recorded = Path(sensors).suffix in (".h5", ".csv")
         source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
     paths = sd.export(filter_file, source, folder=out, rate=rate, magnetometer=magnetometer, to=to, precision=precision)
-    what = f"an IMU at {rate:g} Hz" if sensors is None else f"the sensors of {sensors}"
-    ui.say(f"Filter of {filter_file} with {what}, {precision} precision.")
+    ui.say(f"Filter of {filter_file} for {sensors or f'an IMU at {rate:g} Hz'}, {precision} precision.")
     ui.written(*paths)
 
 

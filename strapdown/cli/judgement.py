@@ -19,9 +19,7 @@ from strapdown.files import reading
 class _Foreign:
     """With a truth: an estimate of any filter."""
 
-    truth: Path | None = Option(
-        None, help="Reference attitudes in any clock and frames: a simulated record, TUM, EuRoC, BROAD, CSV, ROS bag."
-    )
+    truth: Path | None = Option(None, help="Reference attitudes in any clock and frames, a file of any format.")
     error_frame: str = Option("find", help="Frame of the covariance: body, fixed or euler; find: by the errors.")
     align: str = Option(
         "auto",
@@ -54,13 +52,11 @@ def check(
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to search for causes")
     if record is not None and not own:
-        raise InputError(
-            "--record goes with an estimate of `strapdown estimate` without --truth; leave out --truth or --record"
-        )
+        raise InputError("--record goes with an estimate of `strapdown estimate` alone; leave out --truth or --record")
     for name in options_given(foreign) if foreign.truth is None else ():
         raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.aligned is not None:
-        ui.check_files(foreign.aligned, suffixes=(".h5", ".hdf5"), name="aligned")
+        ui.check_files(foreign.aligned, suffixes=ui.HDF5, name="aligned")
     if own:
         held: Any = sd.read(result)
         if record is not None and not isinstance(held, sd.records.Estimate):

@@ -15,11 +15,7 @@ Format = Literal["png", "pdf", "svg"]
 """Formats of figures."""
 FORMAT: Any = Option("png", "--format", help="Format of the figures.")
 FILTER: Any = Option(None, "--filter", help="TOML with a table named filter. Default: a matched one.")
-STATES: Any = Option(
-    None,
-    "--states/--no-states",
-    help="A state for each specified error, or none. Default: if the matched filter needs them.",
-)
+STATES: Any = Option(None, "--states/--no-states", help="States for the specified errors, or none. Default: if needed.")
 GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
 SCENARIO = "Name of a built-in scenario, or a TOML file."
 RECORDING_HELP = (
@@ -74,9 +70,7 @@ class Layout(Samples):
         axes: Any = self.axes or []
         whole = [text for text in axes if "=" not in text]
         if whole and len(axes) > 1:
-            raise InputError(
-                f"--axes {whole[0]} applies to the whole unit; give only it, or the axes of each sensor, such as gyro=y,x,-z"
-            )
+            raise InputError(f"--axes {whole[0]} applies to the whole unit; give only it, or those of each sensor")
         axes = whole[0] if whole else by_name("--axes", axes, "SENSOR=AXES")
         return super().options | {name: value for name, value in (("axes", axes), ("invert", self.invert)) if value}
 

@@ -61,9 +61,7 @@ def convert(
     *,
     source: Path = Argument(metavar="IN", help=f"{RECORDING_HELP}; record of `strapdown simulate`, or estimate.h5."),
     target: Path = Argument(
-        metavar="OUT",
-        help="File whose suffix selects the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); for an "
-        "estimate .csv, .tsv, .parquet, .tum.",
+        metavar="OUT", help="Its suffix selects the format: .csv, .tsv, .parquet, .bag, .mcap, .db3, .h5 (BROAD), .tum."
     ),
     layout: Layout,
     reference: Path | None = Option(None, help="TUM trajectory whose attitudes become the recording's reference."),

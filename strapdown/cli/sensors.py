@@ -31,15 +31,11 @@ def keys(
     """Print the keys of a scenario file with units, defaults and an example. Without a section: all sections."""
     from strapdown.scenarios import keys as reference
 
-    for part in reference.sections() if section is None else reference.named(section):
-        table = reference.listing(part)
-        if section is None or not part.keys:
-            ui.say(table.title)
-        else:
-            ui.show(table)
-            ui.say(f"Example:\n{reference.example(part)}")
     if section is None:
+        ui.say(*(reference.listing(part).title for part in reference.sections()))
         ui.say("The keys of one section: strapdown keys SECTION, such as gyro or coning.")
+    else:
+        ui.show(*map(reference.listing, reference.named(section)))
 
 
 @ui.command()
@@ -51,7 +47,7 @@ def simulate(
     """Simulate a scenario: a record with its truth."""
     loaded = sd.scenarios.load_scenario(scenario)
     target = out or Path(f"{Path(scenario).stem}.h5")
-    ui.check_files(target, suffixes=(".h5", ".hdf5"), own="strapdown record")
+    ui.check_files(target, suffixes=ui.HDF5, own="strapdown record")
     with ui.progress_bar("simulating, writing"):
         record = sd.scenarios.simulate(loaded, seed)
         sd.write(record, target)

@@ -9,11 +9,10 @@ from typing import Any
 from typer import Argument, Option
 
 import strapdown as sd
-from strapdown.checks import non_negative, one_of
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import FILTER, FORMAT, RECORDING_HELP, SCENARIO, STATES, Format, Layout, by_name, numbers
 from strapdown.files import reading, write_json
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
+from strapdown.units import DEGREE
 
 
 @ui.command("tables")
@@ -44,37 +43,14 @@ def coning(
     ui.written(out / "coning.json", *sd.plots.draw_coning_study(study, out, form))
 
 
-def _considered(texts: list[str], sensors: Any) -> dict[str, Any]:
-    """Return errors, given as NAME=VALUE, as arguments of :func:`strapdown.covariance_analysis` in SI units."""
-    sizes = {"scale_factor": 1e-6, "misalignment": 1e-3, "g_sensitivity": DEGREE_PER_HOUR / STANDARD_GRAVITY}
-    sizes |= {"initial.attitude": DEGREE, "initial.bias": DEGREE_PER_HOUR}
-    fields = {"bias": "sensor_bias", "mounting": "mounting", "delay": "time_offset"}
-    for sensor in sensors:
-        bias = {sd.vectors.Magnetometer: 1e-9, sd.vectors.Accelerometer: 1.0}.get(type(sensor), ARCSECOND)
-        sizes |= zip((f"{sensor.name}.{what}" for what in fields), (bias, ARCSECOND, 1e-3), strict=True)
-    errors: dict[str, Any] = {field: {} for field in fields.values()}
-    initial: dict[str, float] = {}
-    for name, text in by_name("--consider", texts, "NAME=VALUE, such as scale_factor=300").items():
-        one_of("--consider", name, sizes)
-        (number,) = numbers(f"--consider {name}", text, "a number", 1)
-        value = non_negative(f"--consider {name}", number) * sizes[name]
-        sensor, _, what = name.rpartition(".")
-        if sensor == "initial":
-            initial[f"initial_{what}_sigma"] = value
-        else:
-            (errors[fields[what]] if sensor else errors)[sensor or name] = value
-    return {"consider": sd.covariance.Consider(**errors), **initial}
-
-
 @ui.command("tables")
 def covariance(
     scenario: str = Argument(help=SCENARIO),
     consider: list[str] | None = Option(
         None,
         metavar="ERROR=σ",
-        help="An error that the filter does not model, with its 1σ: scale_factor (ppm), misalignment (mrad), g_sensitivity (°/h/g); "
-        "SENSOR.bias (nT, m/s², arcsec), SENSOR.mounting (arcsec), SENSOR.delay (ms); or the true 1σ initial.attitude (°), initial.bias "
-        "(°/h). Repeatable.",
+        help="An error without a state, with its 1σ: scale_factor (ppm), misalignment (mrad), g_sensitivity (°/h/g); SENSOR.bias (nT, "
+        "m/s², arcsec), .mounting (arcsec), .delay (ms); or the true 1σ initial.attitude (°), initial.bias (°/h). Repeatable.",
     ),
     filter_file: Path | None = FILTER,
     states: bool | None = STATES,
@@ -84,11 +60,13 @@ def covariance(
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
     from strapdown.estimation import setup
-    from strapdown.workflows.filters import filter_for_scenario, state_words
+    from strapdown.workflows.filters import considered, filter_for_scenario, state_words
 
     body, name = sd.scenarios.load_scenario(scenario), Path(scenario).stem
     ui.check_files(out / "covariance.json", out / f"budget.{form}")
-    errors = _considered(consider or [], body.sensors)
+    named = by_name("--consider", consider or [], "NAME=VALUE, such as scale_factor=300")
+    sizes = {name: numbers(f"--consider {name}", text, "a number", 1)[0] for name, text in named.items()}
+    errors = considered(sizes, body.sensors)
     from_file = None if filter_file is None else setup.read_setup(filter_file)
     filter_setup = filter_for_scenario(body, setup=from_file, states=states)
     with ui.progress_bar("covariance analysis"):
@@ -125,7 +103,7 @@ def integrate(
     out: Path = Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
-    ui.check_files(out, suffixes=(".h5", ".hdf5"), own="strapdown attitude")
+    ui.check_files(out, suffixes=ui.HDF5, own="strapdown attitude")
     rule = sd.coning.named(algorithm)
     with ui.progress_bar("reading, integrating, writing"):
         source: Any = sd.read(recording, gyro_alone=True, **layout.options)

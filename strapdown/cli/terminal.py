@@ -18,9 +18,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 import rich.progress as bars
-import rich.table
 import typer
-from rich import box
 from rich.console import Console
 from rich.text import Text
 from typer import Option
@@ -73,12 +71,12 @@ _EXTRA: dict[str, Any] = {
     "json": Option(None, "--json", help="File for all numbers; - for standard output."),
 }
 """Options that :func:`command` adds and serves."""
+HDF5 = (".h5", ".hdf5")
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 OUTPUTS = ("out", "to", "target", "aligned", "json", "tables")
 """Parameters of commands that name files to write; paths in all others are read."""
-CANNOT_TELL = 3
-STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1}
-"""Exit status of a verdict, otherwise :data:`CANNOT_TELL`; 2 is that of bad usage or input."""
+STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1, "cannot tell": 3}
+"""Exit status of a verdict; 2 is that of bad usage or input."""
 
 _running: dict[str, Any] = {"name": "", "paths": [], "tables": []}
 """Of the command that runs: its name, the paths that it reads, and the tables that it has shown."""
@@ -130,7 +128,7 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
 
                 written(*write([table for table in _running["tables"] if table.name], folder))
             if "verdict" in numbers:
-                raise typer.Exit(STATUS.get(numbers["verdict"], CANNOT_TELL))
+                raise typer.Exit(STATUS[numbers["verdict"]])
 
         parameters = list(_parameters(function, hints))
         options = {parameter.name for parameter in parameters if isinstance(parameter.default, OptionInfo)}
@@ -162,20 +160,14 @@ def say(*sentences: str) -> None:
 
 def show(*tables: Table, title: str | None = None, notes: bool = True) -> None:
     """Print tables, optionally under another title; on a narrow terminal their lines wrap and are not cut off."""
-    styles = {"pass": "green", "FAIL": "red", "likely": "red"}
     for table in tables:
         console.print(title or table.title, style="bold")
-        rows = rich.table.Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
-        for k, column in enumerate(table.head):
-            rows.add_column(column, justify="left" if k < table.left else "right", no_wrap=k > 0 or table.left == 1)
-        for row in table.cells:
-            # Only plain strings are cleared of control characters.
-            rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
-        width, console.width = console.width, 1000
-        try:
-            console.print(rows, crop=False)
-        finally:
-            console.width = width
+        for line in table.lines:
+            row = console.render_str(line)
+            row.highlight_regex(r"(?<!\S)pass$", "green")
+            row.highlight_regex(r"(?<!\S)(FAIL|likely)$", "red")
+            console.print(row)
+        console.print()
         say(*(table.notes if notes else ()))
     _running["tables"].extend(tables)
 
@@ -211,8 +203,6 @@ def written(*paths: Any) -> None:
         console.print("Written: " + ", ".join(map(str, paths)))
 
 
-# ---------------------------------------------------------------------------------------------------------------- progress
-
 LINE_INTERVAL = 10.0
 """Time between two lines if the output is no terminal, s."""
 
@@ -223,19 +213,6 @@ def be_quiet() -> None:
     """Show no progress from now on."""
     global _quiet  # noqa: PLW0603 (one process runs one command)
     _quiet = True
-
-
-def rate_text(speed: float) -> str:
-    """Return a rate with three digits, or as an integer if it has more."""
-    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
-
-
-class _Rate(bars.ProgressColumn):
-    """Runs per second, recent or, of a finished task, on average."""
-
-    def render(self, task: bars.Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{rate_text(speed)} runs/s")
 
 
 @contextlib.contextmanager
@@ -256,10 +233,9 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[[int 
 
     bar = None
     if errors.is_terminal and not _quiet:
-        rate = [_Rate()] if what == "runs" else []
-        known = (bars.MofNCompleteColumn(), *rate, bars.TimeRemainingColumn()) if total else ()
-        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
-        bar = bars.Progress(*columns, console=errors, transient=True)
+        bar = bars.Progress(
+            *bars.Progress.get_default_columns(), bars.TimeElapsedColumn(), console=errors, transient=True
+        )
         task = bar.add_task(what, total=total)
     watcher = Thread(target=watch, daemon=True)
     with bar or contextlib.nullcontext():

@@ -160,6 +160,22 @@ class Campaign(Listed):
         }
 
     @property
+    def words(self) -> list[str]:
+        """Extent, verdict, and what would make it clearer, of a campaign with finished runs."""
+        assert self.statistics is not None
+        judgement, filter_setup = self.statistics.judge(), self.plan.setup
+        words = [
+            f"{self.extent}, computed in {self.seconds:.3g} s. The verdict combines all {len(judgement.findings)} statistics: a consistent "
+            f"filter passes with {100.0 * judgement.confidence_level:g} %.",
+            judgement.words,
+        ]
+        if judgement.verdict == "cannot tell":
+            words.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
+        if judgement.unmodelled and filter_setup.states is None and filter_setup.estimator == setup.MEKF:
+            words.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
+        return words
+
+    @property
     def extent(self) -> str:
         """Numbers of runs, seed and machine, in words."""
         done = 0 if self.statistics is None else self.statistics.runs

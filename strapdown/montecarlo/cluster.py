@@ -167,21 +167,12 @@ def _result(distributed: Any, client: Any, future: Any, chunk: tuple[int, int]) 
         ) from None
     except (CancelledError, distributed.comm.CommClosedError) as error:
         raise _lost(client, error) from None
-    here = identity()
-    if there.version != here.version:
-        raise InputError(
-            f"a worker has strapdown {there.version}, this process {here.version}; install the same everywhere"
-        )
-    if there.sources != here.sources:
-        raise InputError(
-            f"a worker has other sources of strapdown {here.version} (digest {there.sources}) than this process ({here.sources}); "
-            "install the same everywhere and restart the workers"
-        )
-    if there.arithmetic != here.arithmetic:
-        raise InputError(
-            f"a worker computes on {there.arithmetic}, this process on {here.arithmetic}, which round differently; use workers "
-            "of one kind and start the campaign on such a machine"
-        )
+    for name, own, other in zip(Identity._fields, identity(), there, strict=True):
+        if own != other:
+            raise InputError(
+                f"a worker has another {name} of strapdown, {other}, than this process, {own}, and may compute other bits; install the "
+                "same everywhere, on processors of one kind, and restart the workers"
+            )
     result: Parts = parts
     return result
 

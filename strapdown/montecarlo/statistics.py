@@ -22,7 +22,7 @@ errors e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -237,18 +237,8 @@ class Statistics(ByValue, Listed):
         )
 
     def listing(self) -> Table:
-        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
-        judgement = self.judge()
-        rows = [
-            (
-                f"{finding.name} of {finding.label}",
-                finding.value,
-                f"{finding.low:.4f} to {finding.high:.4f}",
-                "FAIL" if finding.rejected else "pass",
-            )
-            for finding in judgement.findings
-            if finding.is_ratio
-        ]
+        """Return the evidence of the verdict as a table, with the errors at the end as its notes."""
+        evidence = self.judge().listing()
 
         def at_the_end(values: Array, axes: slice, unit: float) -> str:
             return ", ".join(figure(x) for x in (values[-1, axes] / unit).tolist())
@@ -263,8 +253,7 @@ class Statistics(ByValue, Listed):
         ]
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
-        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.confidence_level:g} % bounds of all together"
-        return Table(title, ("statistic", "value", "bounds", ""), rows, notes)
+        return replace(evidence, notes=(*evidence.notes, *notes))
 
     @property
     def has_bias(self) -> bool:
@@ -332,11 +321,6 @@ class Statistics(ByValue, Listed):
         return 0.5 * (self.nis_edges[1:] + self.nis_edges[:-1])
 
     @property
-    def nis_sum(self) -> Array:
-        """Σ over runs and sensors of the NIS in each time bin (k,)."""
-        return np.asarray(self.sensor_nis_sum.sum(axis=0))
-
-    @property
     def nis_degrees(self) -> Array:
         """Degrees of freedom in each time bin of one run, mean over runs (k,)."""
         return np.asarray(self.sensor_degrees.sum(axis=0) / self.runs)
@@ -344,12 +328,12 @@ class Statistics(ByValue, Listed):
     @property
     def nis(self) -> Array:
         """NIS per degree of freedom, mean over runs in each time bin (k,); 1 for a consistent filter, NaN without measurements."""
-        return _divided(self.nis_sum, self.sensor_degrees.sum(axis=0))
+        return _divided(self.sensor_nis_sum.sum(axis=0), self.sensor_degrees.sum(axis=0))
 
     @property
     def mean_nis(self) -> float:
         """NIS per degree of freedom over the whole time and all runs; innovations are white, so no epochs are needed."""
-        return float(_divided(self.nis_sum.sum(), self.sensor_degrees.sum()))
+        return float(_divided(self.sensor_nis_sum.sum(), self.sensor_degrees.sum()))
 
     @property
     def sensor_nis(self) -> Array:

@@ -60,5 +60,6 @@ from strapdown.plots.style import (
     save,
     save_as,
 )
+from strapdown.plots.tuning import draw_tuning
 
 __all__ = ["allan_overview", "error_budget", "error_overview", "nees_over_time", "new_figure", "nis_over_time", "save"]

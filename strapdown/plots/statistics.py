@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.ticker import LogFormatter
 
 from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
@@ -19,13 +18,6 @@ from strapdown.plots import style
 from strapdown.units import angle_unit, rate_unit
 
 BOUNDS = "bounds of a consistent filter"
-
-
-class _Plain(LogFormatter):
-    """Labels of a log axis as plain numbers: 0.8 and 2, not 8 × 10⁻¹ and 2 × 10⁰."""
-
-    def _num_to_string(self, x: float, vmin: float, vmax: float) -> str:
-        return f"{x:g}"
 
 
 def nees_over_time(
@@ -60,9 +52,7 @@ def nees_over_time(
     ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label=label)
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **style.layered(k, len(named)))
-    ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(_Plain())
-    ax.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2.0, 0.5)))
+    style.log_scale(ax)
     ax.set_xlabel("time, s")
     ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
     return ax

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -71,6 +72,22 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
             ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
     style.legend_below(figure, list(axes.ravel()), ncols=5)
     return figure
+
+
+def figure_paths(beside: Path, form: str) -> tuple[Path, Path]:
+    """Return the paths of the figures beside a filter: of the likelihood, and of the held-out data."""
+    return beside.with_name(f"{beside.stem}-likelihood.{form}"), beside.with_name(f"{beside.stem}-heldout.{form}")
+
+
+def draw_tuning(tuning: Tuning, slices: Slices, beside: Path, form: str = "png") -> list[Path]:
+    """Write the figures of a tuning beside its filter, in place of those of an earlier one; return the files."""
+    likelihood, heldout = figure_paths(beside, form)
+    figures = {likelihood: likelihood_slices(slices, tuning)}
+    if tuning.comparison is not None:
+        figures[heldout] = before_and_after(tuning.comparison, title="Held-out part of the first record")
+    for other in style.FORMATS:
+        heldout.with_suffix(f".{other}").unlink(missing_ok=True)
+    return style.save_as(figures, form)
 
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:

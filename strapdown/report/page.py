@@ -100,14 +100,11 @@ def code(content: str) -> str:
 
 MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
 """Classes of cells by their text."""
-_NUMBER = re.compile(r"[-+−±×<>≤≥ ]*[\d∞]|-$")
-"""Begin of a cell with a number, or a missing one."""
 
 
 def table(content: Table) -> str:
     """Return a table and its notes, without its title; it scrolls on a narrow page, or without numbers wraps its text."""
-    filled = [any(_NUMBER.match(row[k]) for row in content.cells) for k in range(len(content.head))]
-    kinds = [' class="number"' if k >= content.left and filled[k] else "" for k in range(len(filled))]
+    kinds = [' class="number"' if side == "right" else "" for side in content.sides]
     heads = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
     lines = [f"<tr>{heads}</tr>"]
     for row in content.cells:

@@ -118,14 +118,17 @@ def named(name: str) -> list[Section]:
 
 
 def listing(section: Section) -> Table:
-    """Return the keys of a section as a table."""
+    """Return the keys of a section as a table, with an example as its note."""
     plain = lambda text: text.replace("`", "")  # noqa: E731
     rows = [
         (" or ".join((key.name, *key.others)), key.unit, key.type, plain(key.default), plain(key.meaning))
         for key in section.keys
     ]
     title = section.header + (f', type = "{section.type}"' if section.type else "")
-    return Table(f"{title}: {plain(section.summary)}", ("key", "unit", "value", "default", "meaning"), rows, left=5)
+    notes = [f"Example:\n{example(section)}"] if rows else []
+    return Table(
+        f"{title}: {plain(section.summary)}", ("key", "unit", "value", "default", "meaning"), rows, notes, left=5
+    )
 
 
 def example(section: Section) -> str:
