@@ -22,7 +22,7 @@ class _Identification:
     sensor: list[str] | None = Option(None, help="gyro (default), accelerometer or magnetometer; may be repeated.")
     rate: float | None = Option(None, help="Sample rate of an NPY file, Hz.")
     highest_frequency: float | None = Option(None, help="Maximum frequency of the fit, Hz.")
-    temperature: int | None = Option(None, metavar="ORDER", help="Subtract a polynomial of the recorded temperature.")
+    temperature: int | None = Option(None, metavar="ORDER", help="Order of the temperature's polynomial to subtract.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 class _Model:
     """Filter and errors; a campaign file contains its own."""
 
-    filter_file: Path | None = Option(None, "--filter", help="TOML, or FILE.py:NAME, your own, which is executed.")
+    filter_file: Path | None = Option(
+        None, "--filter", help="TOML with a filter table; or FILE.py:NAME, your own, executed."
+    )
     gyro: Path | None = GYRO
     dispersions: Path | None = Option(None, help="TOML with a table named dispersions: what differs from run to run.")
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")

@@ -13,8 +13,10 @@ from strapdown.cli import terminal as ui
 
 @ui.command()
 def export(
-    filter_file: str = Argument(metavar="FILTER", help="TOML; or hand, vehicle, vessel, any: that of `estimate`."),
-    sensors: str | None = Argument(None, help="Simulated record, or scenario, with the sensors of a TOML's filter."),
+    filter_file: str = Argument(
+        metavar="FILTER", help="TOML of a filter; or hand, vehicle, vessel, any: that of `estimate`."
+    ),
+    sensors: str | None = Argument(None, help="Record or scenario whose sensors the filter of a TOML file uses."),
     rate: float | None = Option(None, help="Sample rate of the IMU, Hz."),
     magnetometer: bool = Option(False, "--magnetometer", help="The IMU has a magnetometer."),
     to: Literal["c", "js"] = Option("c", "--to", help="Language: C99, or JavaScript (an ES module)."),

@@ -19,7 +19,7 @@ from strapdown.files import reading
 class _Foreign:
     """With a truth: an estimate of any filter."""
 
-    truth: Path | None = Option(None, help="Reference attitudes in any clock and frames, a file of any format.")
+    truth: Path | None = Option(None, help="Reference attitudes, any clock and frames: TUM, EuRoC, BROAD, CSV, bag.")
     error_frame: str = Option("find", help="Frame of the covariance: body, fixed or euler; find: by the errors.")
     align: str = Option(
         "auto",
