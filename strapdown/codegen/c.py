@@ -9,7 +9,7 @@ import textwrap
 import numpy as np
 
 from strapdown.codegen.program import Program, Sensor
-from strapdown.codegen.target import Target, traced
+from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 
 PUBLIC = ("init", "predict")
@@ -302,9 +302,8 @@ target_link_libraries(strapdown_example strapdown_filter)
 """
 
 
-def files(program: Program, origin: str, *, single: bool) -> dict[str, str]:
+def files(program: Program, functions: list[Target], origin: str, *, single: bool) -> dict[str, str]:
     """Return the files of the filter by name."""
-    functions = traced(program)
     return {
         "strapdown_filter.h": header(program, functions, origin, single=single),
         "strapdown_filter.c": source(program, functions, origin, single=single),
