@@ -582,7 +582,7 @@ class Strict(np.ndarray):
 
 def windows():
     """Tables of every solver that takes a window, and of those that take the step alone."""
-    for n, p, f in itertools.product((1, 2, 3), (0, 1, 2, 5), (0, 1, 3)):
+    for n, p, f in itertools.product((1, 3), (0, 2, 5), (0, 1, 3)):
         if f == 0:
             yield coning.algorithms.compressed(n, p)
         taylor = exact.taylor_pairs(n, p, f)
@@ -603,7 +603,7 @@ def test_no_kernel_reads_or_writes_outside_its_arrays(monkeypatch):
 
     monkeypatch.setattr(coning.stepping, "compiled", checked)
     tables = list(windows())
-    assert len(tables) > 60
+    assert len(tables) > 40
     generator = np.random.default_rng(5)
     for table in tables:
         for length in {0, 1, table.samples - 1, table.samples, table.window - 1, table.window + table.samples + 1}:

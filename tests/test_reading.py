@@ -221,7 +221,7 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
 
     for _ in range(3):  # what else the machine does only adds to a time: one attempt within the bounds is enough
         took = []
-        for number in (25_000, 100_000) if unit == ",a" else (100_000, 400_000):  # columns take longest
+        for number in (12_500, 50_000) if unit == ",a" else (50_000, 200_000):  # columns take longest
             path.write_text(begin + unit * number + end)
             took.append(processor_seconds(refused))
         if took[1] < min(8.0 * took[0] + 0.5, 5.0):
@@ -232,11 +232,11 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
 
 def test_a_csv_of_many_columns_is_read(tmp_path):
     path = tmp_path / "wide.csv"
-    extra = 50_000
+    extra = 20_000
     rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
     path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
     captured = []
-    assert processor_seconds(lambda: captured.append(recordings.read(path))) < 3.0
+    assert processor_seconds(lambda: captured.append(recordings.read(path))) < 1.2
     assert captured[0].rate.shape == (3, 3)
 
 
