@@ -13,6 +13,8 @@ from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 
 PUBLIC = ("init", "predict")
+SMALLEST = float(np.finfo(np.float32).tiny)
+"""Smallest number with all its digits in single precision."""
 TYPES = {"": "strapdown_real", "int": "int", "wide": "double", "status": "unsigned"}
 
 
@@ -21,6 +23,8 @@ def _number(x: float, single: bool) -> str:
         return "INFINITY" if x > 0.0 else "-INFINITY"
     if not single:
         return repr(x)
+    if 0.0 < abs(x) < SMALLEST:  # a bound that keeps a divisor from zero
+        x = math.copysign(SMALLEST, x)
     text = str(np.float32(x))
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
