@@ -36,13 +36,6 @@ UNITS = {"gyro": "rad/s"}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    where = tmp_path_factory.mktemp("files")
-    targets(where)
-    return where
-
-
-@pytest.fixture(scope="module")
 def known(tmp_path_factory):
     return {target.name: target for target in targets(tmp_path_factory.mktemp("known"))}
 
