@@ -135,7 +135,8 @@ def program(name, *, single=False):
 @functools.cache
 def plain(name):
     rows, start = rows_of(name)
-    return fed(Plain(program(name)), rows, start)
+    f = Plain(program(name))
+    return *fed(f, rows, start), f
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -143,7 +144,7 @@ def test_c_equals_python_to_the_bit(name, tmp_path):
     rows, start = rows_of(name)
     compiled = Compiled(program(name), tmp_path, flags=("-O2" if name == "gate" else "-O0",))
     numbers, statuses = fed(compiled, rows, start)
-    expected, expected_statuses = plain(name)
+    expected, expected_statuses, _ = plain(name)
     assert statuses == expected_statuses
     assert np.isfinite(expected).all()
     np.testing.assert_array_equal(numbers, expected)
@@ -177,7 +178,7 @@ def some(*names, of=tuple(CASES)):
 def test_javascript_equals_python_to_the_bit(name, tmp_path):
     rows, start = rows_of(name)
     numbers, statuses = fed_javascript(program(name), tmp_path, rows, start)
-    expected, expected_statuses = plain(name)
+    expected, expected_statuses, _ = plain(name)
     assert statuses == expected_statuses
     np.testing.assert_array_equal(numbers, expected)
 
@@ -185,9 +186,7 @@ def test_javascript_equals_python_to_the_bit(name, tmp_path):
 def test_the_cases_take_the_rare_branches():
     """Otherwise equality of bits would say nothing about them."""
     for name in ("gate", "precise"):
-        rows, start = rows_of(name)
-        f = Plain(program(name))
-        _, statuses = fed(f, rows, start)
+        _, statuses, f = plain(name)
         assert statuses.count(0) > 0.9 * len(statuses)
         assert (2 in statuses) == (name == "gate")
         assert f.far_turns > 0
@@ -206,7 +205,7 @@ def test_program_equals_the_compiled_filter(name):
         sensors=record.vectors,
         gate=setup.gate,
     )
-    numbers, statuses = plain(name)
+    numbers, statuses, _ = plain(name)
     n = 6 + len(live.values)
     names = list(kinds)
     for k, (sensor, value, dt) in enumerate(rows):
@@ -233,7 +232,7 @@ def test_single_precision_within_a_thirtieth_of_sigma(name, tmp_path):
     rows, start = rows_of(name)
     compiled = Compiled(program(name, single=True), tmp_path, single=True)
     numbers, statuses = fed(compiled, rows, start)
-    expected, expected_statuses = plain(name)
+    expected, expected_statuses, _ = plain(name)
     n, whole = compiled.program.n, len(rows) - 1
     assert np.mean(np.array(statuses) != expected_statuses) < 0.01
     P = np.zeros((n, n))

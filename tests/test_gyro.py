@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, signal, stats
 
-from sims import flicker_in_filter, simulate_imu
+from sims import flicker_in_filter
 from strapdown import gyro, units
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec, datasheets, flicker
@@ -648,11 +648,3 @@ def test_filters_on_presets_with_flicker(tmp_path):
 @pytest.mark.parametrize("name", datasheets.PRESETS)
 def test_filters_on_presets_at_their_natural_rates(name):
     judged(flicker_in_filter.main(presets=(name,), runs=60, duration=600.0).outcomes[0])
-
-
-def test_the_sim_finds_the_spectra_of_its_specification(tmp_path):
-    result = simulate_imu.main(samples=1 << 16, out=tmp_path)
-    assert (tmp_path / "simulate_imu.png").exists()
-    assert set(result.worst) == {"angle random walk", "flicker", "rate random walk", "whole"}
-    # The largest of 50 bands, some of few lines whose χ² is skew.
-    assert all(1.0 < score < 5.0 for score in result.worst.values())
