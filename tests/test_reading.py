@@ -75,17 +75,18 @@ def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):
     path = tmp_path / os.fsdecode(b"w\xff.csv")
     path.write_bytes(known["walk.csv"].content)
     assert len(recordings.read(path).time) == 20
-    _written(tmp_path / "again.h5", attributes={"note": str(path)})
+    with records.result_file(tmp_path / "again.h5", "record", {"note": str(path)}):
+        pass
     assert records.read_attributes(tmp_path / "again.h5")["note"] == str(tmp_path / "w\\udcff.csv")
     tuning = tmp_path / os.fsdecode(b"t\xff.json")
     tuning.write_bytes(known["tuning.json"].content)
     assert report.write(tuning).page.stat().st_size > 1000
 
 
-def _written(path, **more) -> Path:
+def _written(path) -> Path:
     increments = np.random.default_rng(2).standard_normal((2000, 3))
     origin = records.Origin(scenario=scenarios.load_scenario("two-stars"), seed=3)
-    recordfiles.write_record(path, ImuRecord(time=np.arange(2001.0), increments=increments, origin=origin), **more)
+    recordfiles.write_record(path, ImuRecord(time=np.arange(2001.0), increments=increments, origin=origin))
     return path
 
 
@@ -340,7 +341,8 @@ def test_a_written_file_is_hdf5_to_others_with_its_digest_in_front(tmp_path):
         assert file.userblock_size == 512
         assert file.attrs["kind"].decode() == "strapdown record"
     long = "é" * 100_000
-    _written(tmp_path / "long.h5", attributes={"text": long, "empty": "", "list": ["a", "é", ""]})
+    with records.result_file(tmp_path / "long.h5", "record", {"text": long, "empty": "", "list": ["a", "é", ""]}):
+        pass
     held = records.read_attributes(tmp_path / "long.h5")
     assert [held[name] for name in ("text", "empty", "list")] == [long, "", ["a", "é", ""]]
 

@@ -13,7 +13,7 @@ from strapdown import scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.recordings.recordfiles import read_record, write_record
-from strapdown.records import ImuRecord, read_attributes
+from strapdown.records import ImuRecord, Origin, read_attributes
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
 
@@ -40,14 +40,13 @@ def written(simulated, tmp_path):
 def test_hdf5_reads_back_equal_with_all_that_it_holds(simulated, tmp_path):
     scenario, record = simulated
     path = tmp_path / "deep" / "record.h5"
-    write_record(path, record, attributes={"place": "bench", "weight": 2.5})
+    write_record(path, record)
     back = read_record(path)
     assert not differing(back, record)
     assert back.origin.gyro == scenario.gyro
     assert scenarios.scenario_to_toml(back.origin.scenario) == scenarios.scenario_to_toml(scenario)
     assert (back.origin.seed, back.origin.run) == (3, 1)
-    held = read_attributes(path)
-    assert (held["version"], held["place"], held["weight"]) == (strapdown.__version__, "bench", 2.5)
+    assert read_attributes(path)["version"] == strapdown.__version__
     assert not differing(scenarios.simulate(back.origin.scenario, back.origin.seed, back.origin.run), record)
 
 
@@ -122,9 +121,7 @@ def test_a_failed_write_leaves_the_old_file(simulated, tmp_path):
     write_record(path, simulated[1])
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        write_record(path, simulated[1], attributes={"thing": object()})
-    with pytest.raises(InputError, match="choose another name"):
-        write_record(path, simulated[1], attributes={"seed": 3})
+        write_record(path, dataclasses.replace(simulated[1], origin=Origin(source=object())))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["record.h5"]
 
