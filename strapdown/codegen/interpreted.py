@@ -417,7 +417,7 @@ class Interpreter:
                 array.forget()
             here = env | {name: variable.value() for name, variable in variables.items()}
             for condition in conditions:
-                m.unless(self._value(condition, here), m.leave_loop)
+                m.branch(self.helpers["_no_"](self._value(condition, here)), m.leave_loop)
             if counter is not None:
                 here[counter[0]] = counter[1]
             result = self._statements(list(body), here)
