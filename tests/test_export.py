@@ -139,7 +139,12 @@ def plain(name):
     return *fed(f, rows, start), f
 
 
-@pytest.mark.parametrize("name", CASES)
+def some(*names, of=tuple(CASES)):
+    """Cases of a test; those that are not named are slow."""
+    return [pytest.param(name, marks=() if name in names else pytest.mark.slow) for name in of]
+
+
+@pytest.mark.parametrize("name", some(*(name for name in CASES if name != "hand")))  # as in the filter of an IMU
 def test_c_equals_python_to_the_bit(name, tmp_path):
     rows, start = rows_of(name)
     compiled = Compiled(program(name), tmp_path, flags=("-O2" if name == "gate" else "-O0",))
@@ -167,11 +172,6 @@ def test_recorded_samples_give_the_bits_of_python(broad, tmp_path):
     assert statuses == expected_statuses
     assert 0.01 < np.mean(np.array(statuses) == 2) < 0.9
     np.testing.assert_array_equal(numbers, expected)
-
-
-def some(*names, of=tuple(CASES)):
-    """Cases of a test; those that are not named are slow."""
-    return [pytest.param(name, marks=() if name in names else pytest.mark.slow) for name in of]
 
 
 @pytest.mark.parametrize("name", some("every sensor", "drift", "bias"))
@@ -247,8 +247,17 @@ def test_single_precision_within_a_thirtieth_of_sigma(name, tmp_path):
 HOSTILE = [np.nan, np.inf, -np.inf, 1e9, -1e9, 1e300, 1e-300, 0.0]
 
 
-@pytest.mark.parametrize("single", [False, True])
-@pytest.mark.parametrize("name", some("scale", "bias", of=("every sensor", "scale", "bias", "correlated")))
+@pytest.mark.parametrize(
+    ("name", "single"),
+    [
+        *(("scale", False), ("bias", False), ("bias", True)),
+        *(
+            pytest.param(name, single, marks=pytest.mark.slow)
+            for name in ("every sensor", "correlated")
+            for single in (False, True)
+        ),
+    ],
+)
 def test_hostile_samples_set_a_flag_and_leave_the_state_valid(name, single, tmp_path):
     _, _, start = case(name)
     f = Compiled(program(name, single=single), tmp_path, single=single)
