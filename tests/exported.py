@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import math
 import shutil
 import subprocess
-from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
-from strapdown.codegen import c, design, recording
+from strapdown.codegen import c, javascript, recording, target
 from strapdown.codegen import program as body
 from strapdown.codegen.interpreted import FORMULAS
-from strapdown.codegen.target import OWN
 from strapdown.kernels import machine
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic", "-ffp-contract=off")
@@ -57,7 +56,7 @@ class PlainModule:
         if value not in self.made:
             names = dict(value.__globals__)
             function = FunctionType(value.__code__, names, value.__name__, value.__defaults__)
-            self.made[value] = self.recorded(function) if value in OWN else function
+            self.made[value] = self.recorded(function) if value in target.OWN else function
             for name in machine._names(value.__code__):
                 if name in self.replaced or name in names:
                     names[name] = self.bound(self.replaced.get(name, names.get(name)))
@@ -131,31 +130,32 @@ class Plain:
         return np.array([*self.f.x, *self.f.P, *self.f.nis])
 
 
+functions_of = functools.cache(target.traced)
+"""Functions of a program, traced once for C, JavaScript and sanitizers."""
+
+
+def c_files(program, *, single=False):
+    return c.files(program, functions_of(program), "test", single=single)
+
+
+def write(files, folder):
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
 class Compiled:
     """The filter in C, compiled into a library: once for a program. An optimising compiler takes three times as long."""
 
-    _sources: ClassVar[dict[Any, tuple[Any, dict[str, str]]]] = {}
     _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
     def __init__(self, program, folder, *, single=False, flags=("-O0",)):
-        folder = Path(folder)
-        if (id(program), single) not in self._sources:
-            self._sources[id(program), single] = program, c.files(program, "test", single=single)
-        files = self._sources[id(program), single][1]
         flags = (*flags, "-Wdouble-promotion") if single else flags
-        for name, text in files.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        key = (*files.items(), *flags)
+        key = program, flags
         if key not in self._libraries:
-            library = folder / "filter.so"
-            subprocess.run(
-                [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", library.name, "-lm"],
-                cwd=folder,
-                check=True,
-                capture_output=True,
-                text=True,
-            )
-            self._libraries[key] = ctypes.CDLL(str(library.resolve()))
+            write(c_files(program, single=single), folder)
+            build = [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", "filter.so", "-lm"]
+            subprocess.run(build, cwd=folder, check=True, capture_output=True, text=True)
+            self._libraries[key] = ctypes.CDLL(str(folder / "filter.so"))
         self.real = ctypes.c_float if single else ctypes.c_double
         types = {"": self.real, "int": ctypes.c_int, "wide": ctypes.c_double}
         fields = [(name, types[kind] * size if size else types[kind]) for name, size, _, kind in c.members(program)]
@@ -197,8 +197,17 @@ class Compiled:
         return np.array(out[:])
 
 
-def program_of(setup, sensors, *, single=False):
-    return design.program_of(setup, sensors, single=single)
+def run_sanitized(files, folder):
+    """Run a program with the checks of addresses and of undefined behaviour; it must end well."""
+    write(files, folder)
+    sanitize = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-conversion"]
+    build = [compiler(), *STRICT, *sanitize, "main.c", "strapdown_filter.c", "-o", "run", "-lm"]
+    done = subprocess.run(build, cwd=folder, capture_output=True, text=True, check=False)
+    if "cannot find" in done.stderr:
+        pytest.skip(f"no sanitizers: {done.stderr.splitlines()[0]}")
+    assert done.returncode == 0, done.stderr
+    run = subprocess.run(["./run"], cwd=folder, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
 
 
 def samples(record, kinds):
@@ -231,17 +240,21 @@ def fed(f, rows, start):
     return np.array(numbers), statuses
 
 
-def node():
+def by_node(program, feed, inputs, folder):
+    """Return what a script that feeds the ES module with inputs prints, as JSON."""
     path = shutil.which("node")
     if path is None:
         pytest.skip("no node on this machine")
-    return path
+    files = javascript.files(program, functions_of(program), "test")
+    write({**files, "feed.mjs": feed, "inputs.json": json.dumps(inputs)}, folder)
+    run = subprocess.run([path, "feed.mjs"], cwd=folder, check=True, capture_output=True, text=True)
+    return json.loads(run.stdout)
 
 
 FEED = """
 import * as filter from './strapdown_filter.mjs';
 import fs from 'fs';
-const {rows, start, names} = JSON.parse(fs.readFileSync('rows.json'));
+const {rows, start, names} = JSON.parse(fs.readFileSync('inputs.json'));
 const f = filter.create();
 filter.init(f, start);
 const numbers = [], statuses = [];
@@ -255,14 +268,6 @@ console.log(JSON.stringify([numbers, statuses]));
 
 def fed_javascript(program, folder, rows, start):
     """Feed the ES module, by node."""
-    from strapdown.codegen import javascript
-
-    folder = Path(folder)
-    for name, text in javascript.files(program, "test").items():
-        (folder / name).write_text(text, encoding="utf-8")
-    (folder / "feed.mjs").write_text(FEED, encoding="utf-8")
     inputs = {"rows": rows, "start": list(start), "names": [sensor.name for sensor in program.sensors]}
-    (folder / "rows.json").write_text(json.dumps(inputs), encoding="utf-8")
-    run = subprocess.run([node(), "feed.mjs"], cwd=folder, check=True, capture_output=True, text=True)
-    numbers, statuses = json.loads(run.stdout)
+    numbers, statuses = by_node(program, FEED, inputs, folder)
     return np.array(numbers), statuses

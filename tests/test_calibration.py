@@ -27,7 +27,7 @@ SETS = Path(__file__).parents[2] / "shared" / "data" / "sassari"
 def turned():
     """A unit, its recording with pauses, and its calibration."""
     unit = study.drawn_unit(3)
-    recording = study.simulated(unit, 3, 0, 60.0)
+    recording = study.simulated(unit, 3, 0, 45.0)
     return unit, recording, sd.calibrate(recording)
 
 
@@ -241,7 +241,7 @@ def test_samples_are_corrected(turned):
     known = UnitCalibration(**{**vars(unit), "magnetic_unit": "mG"})
     known = dataclasses.replace(known, hard_iron=10.0 * known.hard_iron)  # 1 µT is 10 mG
     clean = known.applied(recording)
-    ideal = study.simulated(SensorErrors(magnetometer_delay=study.DELAY), 3, 0, 60.0)
+    ideal = study.simulated(SensorErrors(magnetometer_delay=study.DELAY), 3, 0, 45.0)
     for name in ("rate", "specific_force", "magnetic_field"):
         # the same noise, but for the sensor's matrix
         assert np.abs(getattr(clean, name) - getattr(ideal, name)).max() < 0.3 * np.ptp(getattr(ideal, name)) * 0.05

@@ -16,7 +16,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unit")
     unit = study.drawn_unit(8)
     for name, run, pauses in (("turned", 0, True), ("moved", 1, False)):
-        recording = dataclasses.replace(study.simulated(unit, 8, run, 15.0, pauses=pauses), true_attitude=None)
+        recording = dataclasses.replace(study.simulated(unit, 8, run, 11.0, pauses=pauses), true_attitude=None)
         recordings.write(recording, folder / f"{name}.csv")
     return folder
 
@@ -25,7 +25,7 @@ def test_the_command_is_the_function_and_estimate_reads_its_file(succeeds, files
     out = tmp_path / "unit.toml"
     said = succeeds("calibrate", files / "turned.csv", "--out", out)
     assert "gyro scale x" in said
-    assert "good is" in said  # a quarter of a minute is short
+    assert "good is" in said  # eleven seconds are short
     unit = sd.calibrate(sd.read(files / "turned.csv"))
     again = calibration.read(out)
     assert list(again.entries()) == list(unit.entries())

@@ -122,13 +122,6 @@ def test_fixed_frame_rates(name):
     np.testing.assert_allclose(attitude, quaternion.conjugate(mirrored), atol=1e-15)
 
 
-def test_body_and_fixed_rates_of_one_motion_agree():
-    cone = motion.SpinCone(precession_rate=1.3, spin_rate=0.8, angle=0.4)
-    t = np.linspace(0.0, 3.0, 61)
-    body = coning.integrate(cone.increments(t), "matched-1-8-8", cone.attitude(0.0))
-    assert angle_errors(body, cone.attitude(t)).max() < 1e-13
-
-
 def test_an_hour_at_a_kilohertz_accumulates_rounding_as_the_root_of_the_count():
     # Single-axis increments commute, so that the truth is the angle's exact sum; a generic axis makes every product round.
     n = 3_600_000
@@ -243,6 +236,8 @@ def test_the_record_and_the_attitude_are_left_alone():
     coning.integrate(-increments)
     np.testing.assert_array_equal(increments, kept)
     np.testing.assert_array_equal(first, again)
+    coning.rotation_vectors(increments, "one-sample")[:] = 9.0
+    np.testing.assert_array_equal(increments, kept)
     # Neither layout nor type of the array matters.
     np.testing.assert_array_equal(coning.integrate(np.asfortranarray(increments)), first)
     np.testing.assert_array_equal(coning.integrate(increments.tolist()), first)
@@ -446,42 +441,28 @@ def test_rate_samples_cost_what_the_docstring_says():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("call", "arguments", "message"),
     [
-        (([[1.0, 2.0]],), "increments has shape"),
-        (([[0.0, math.nan, 0.0]],), r"increments\[0, 1\] is nan"),
-        (([[0.0, 0.0, 0.0]], "two-samples"), "did you mean 'two-sample'"),
-        (([[0.0, 0.0, 0.0]], "one-sample", (2.0, 0.0, 0.0, 0.0)), "norm 2"),
-        (([[0.0, 0.0, 0.0]], "one-sample", np.eye(4)), "initial_attitude has shape"),
+        (coning.integrate, ([[1.0, 2.0]],), "increments has shape"),
+        (coning.integrate, ([[0.0, math.nan, 0.0]],), r"increments\[0, 1\] is nan"),
+        (coning.integrate, (np.zeros((1, 3)), "two-samples"), "did you mean 'two-sample'"),
+        (coning.integrate, (np.zeros((1, 3)), "one-sample", (2.0, 0.0, 0.0, 0.0)), "norm 2"),
+        (coning.integrate, (np.zeros((1, 3)), "one-sample", np.eye(4)), "initial_attitude has shape"),
+        (functools.partial(coning.integrate, frame="fixd"), (np.zeros((1, 3)),), "did you mean 'fixed'"),
+        (coning.increments_from_rates, (np.zeros((5, 3)), 0.1, 3), "even"),
+        (coning.increments_from_rates, (np.zeros((1, 3)), 0.1), "at least 2"),
+        (coning.increments_from_rates, (np.zeros((5, 3)), 0.0), "sample_interval"),
     ],
 )
-def test_bad_input(arguments, message):
+def test_bad_input(call, arguments, message):
     with pytest.raises(InputError, match=message):
-        coning.integrate(*arguments)
-
-
-def test_bad_frame_and_rates():
-    with pytest.raises(InputError, match="did you mean 'fixed'"):
-        coning.integrate([[0.0, 0.0, 0.0]], frame="fixd")
-    with pytest.raises(InputError, match="even"):
-        coning.increments_from_rates(np.zeros((5, 3)), 0.1, 3)
-    with pytest.raises(InputError, match="at least 2"):
-        coning.increments_from_rates(np.zeros((1, 3)), 0.1)
-    with pytest.raises(InputError, match="sample_interval"):
-        coning.increments_from_rates(np.zeros((5, 3)), 0.0)
+        call(*arguments)
 
 
 def test_time_per_sample_is_a_time():
     assert 1e-10 < coning.time_per_sample("two-sample", 1000) < 1e-3
     with pytest.raises(InputError, match="samples"):
         coning.time_per_sample("eight-sample", 4)
-
-
-def test_input_is_not_changed_and_output_is_its_own():
-    increments = np.full((4, 3), 0.1)
-    vectors = coning.rotation_vectors(increments, "one-sample")
-    vectors[:] = 9.0
-    assert np.all(increments == 0.1)
 
 
 # ----------------------------------------------------------------------------------------------------------- tables of one's own
@@ -513,18 +494,6 @@ def test_savages_two_speed_algorithm_is_its_published_recursion(samples):
         expected.append(alpha + beta)
     rotations = coning.rotation_vectors(increments, two_speed(samples))
     np.testing.assert_allclose(rotations[1:], expected, rtol=0.0, atol=1e-15)
-
-
-def test_savages_two_speed_algorithm_drifts_as_its_table_says():
-    """−C β² ω λ⁴, measured on a cone against its closed form."""
-    cone, h = motion.Coning(angle=0.01, frequency=1.0), 0.02
-    edges = np.arange(4001) * h
-    table = two_speed(4)
-    attitude = coning.integrate(cone.increments(edges), table, cone.attitude(edges[0]))
-    error = quaternion.multiply(attitude, quaternion.conjugate(cone.attitude(edges[::4])))
-    rate = 2.0 * (error[-1, 3] - error[100, 3]) / (edges[-1] - edges[400])
-    omega = 2.0 * math.pi
-    assert rate == pytest.approx(-float(table.drift_constant) * 1e-4 * omega * (omega * h) ** 4, rel=0.02)
 
 
 @pytest.mark.parametrize(("previous", "following"), [(1, 0), (0, 1), (2, 3), (4, 0)])
@@ -582,7 +551,7 @@ class Strict(np.ndarray):
 
 def windows():
     """Tables of every solver that takes a window, and of those that take the step alone."""
-    for n, p, f in itertools.product((1, 2, 3), (0, 1, 2, 5), (0, 1, 3)):
+    for n, p, f in itertools.product((1, 3), (0, 2, 5), (0, 1, 3)):
         if f == 0:
             yield coning.algorithms.compressed(n, p)
         taylor = exact.taylor_pairs(n, p, f)
@@ -603,7 +572,7 @@ def test_no_kernel_reads_or_writes_outside_its_arrays(monkeypatch):
 
     monkeypatch.setattr(coning.stepping, "compiled", checked)
     tables = list(windows())
-    assert len(tables) > 60
+    assert len(tables) > 40
     generator = np.random.default_rng(5)
     for table in tables:
         for length in {0, 1, table.samples - 1, table.samples, table.window - 1, table.window + table.samples + 1}:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, signal, stats
 
-from sims import flicker_in_filter, simulate_imu
+from sims import flicker_in_filter
 from strapdown import gyro, units
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec, datasheets, flicker
@@ -171,12 +171,12 @@ def test_markov_step_against_closed_forms_in_fifty_digits(u):
 
 def test_markov_bias_is_stationary_from_the_first_sample():
     spec = GyroSpec(markov_noise=0.3, markov_correlation_time=2.0)
-    runs = np.concatenate([simulate(spec, samples=40, dt=0.5, run=k).bias for k in range(1500)], axis=1)
+    runs = np.concatenate([simulate(spec, samples=40, dt=0.5, run=k).bias for k in range(500)], axis=1)
     variance = np.mean(runs**2, axis=1)
     wanted = 0.3**2 * 2.0 / 2.0
-    assert np.all(np.abs(variance / wanted - 1.0) < 5.0 * math.sqrt(2.0 / 4500))
+    assert np.all(np.abs(variance / wanted - 1.0) < 5.0 * math.sqrt(2.0 / 1500))
     correlation = np.mean(runs[0] * runs[4]) / wanted
-    assert correlation == pytest.approx(math.exp(-1.0), abs=5.0 / math.sqrt(4500))
+    assert correlation == pytest.approx(math.exp(-1.0), abs=5.0 / math.sqrt(1500))
 
 
 def test_markov_increments_have_the_exact_variance_given_the_ends():
@@ -200,9 +200,9 @@ def test_infinite_correlation_time_is_a_random_walk():
 
 def test_turn_on_bias_is_drawn_anew_for_each_run():
     spec = GyroSpec(turn_on_bias=[1.0, 2.0, 3.0], turn_on_bias_sigma=[0.1, 0.2, 0.3])
-    starts = np.array([simulate(spec, samples=1, run=k).bias[0] for k in range(2000)])
-    np.testing.assert_allclose(starts.mean(axis=0), [1.0, 2.0, 3.0], atol=0.3 * 4.5 / math.sqrt(2000))
-    np.testing.assert_allclose(starts.std(axis=0), [0.1, 0.2, 0.3], rtol=4.5 / math.sqrt(4000))
+    starts = np.array([simulate(spec, samples=1, run=k).bias[0] for k in range(500)])
+    np.testing.assert_allclose(starts.mean(axis=0), [1.0, 2.0, 3.0], atol=0.3 * 4.5 / math.sqrt(500))
+    np.testing.assert_allclose(starts.std(axis=0), [0.1, 0.2, 0.3], rtol=4.5 / math.sqrt(1000))
 
 
 def test_each_term_has_a_stream_of_its_own():
@@ -290,15 +290,15 @@ def flicker_difference_covariance(lags):
 
 
 def test_spectrum_of_flicker_from_the_record_length_to_nyquist():
-    series = records(GyroSpec(bias_instability=0.7), 1025, 150, lambda o: np.diff(o.rates, axis=0))
+    series = records(GyroSpec(bias_instability=0.7), 1025, 60, lambda o: np.diff(o.rates, axis=0))
     check_spectrum(series, 0.49 * flicker_difference_covariance(1024))
 
 
 def test_flicker_is_stationary_from_the_first_sample():
     wanted = flicker.shaping(50).variance
-    series = records(GyroSpec(bias_instability=1.0), 50, 1000, lambda o: o.rates)
+    series = records(GyroSpec(bias_instability=1.0), 50, 400, lambda o: o.rates)
     variance = np.mean(series**2, axis=1) / wanted
-    assert np.all(np.abs(variance - 1.0) < 5.0 * math.sqrt(2.0 / 3000))
+    assert np.all(np.abs(variance - 1.0) < 5.0 * math.sqrt(2.0 / 1200))
 
 
 def test_flicker_shows_in_the_bias_as_the_mean_of_neighbours():
@@ -342,12 +342,12 @@ def test_low_pass_answers_a_ramp_as_the_differential_equation_says():
     area = edges + edges**2
     output = simulate(GyroSpec(bandwidth=8.0, damping=damping), np.tile(np.diff(area)[:, None], 3), edges)
     A = np.array([[0.0, 1.0, 0.0], [-(natural**2), -2.0 * damping * natural, 0.0], [1.0, 0.0, 0.0]])
-    fine = np.linspace(0.0, 4.0, 80_001)
+    fine = np.linspace(0.0, 4.0, 8_001)
     rate = 1.0 + 2.0 * fine
     _, out, _ = signal.lsim(
         (A, [[0.0], [natural**2], [0.0]], [[0.0, 0.0, 1.0]], [[0.0]]), rate, fine, X0=[1.0 + dt, 0.0, 0.0]
     )
-    wanted = np.diff(out[::200])
+    wanted = np.diff(out[::20])
     np.testing.assert_allclose(output.increments[:, 0], wanted, rtol=1e-7, atol=1e-10)
     late = 2.0 * damping / natural  # a ramp comes out later by 2ζ/ω
     np.testing.assert_allclose(output.rates[-1], 1.0 + 2.0 * (4.0 - 0.5 * dt - late), rtol=1e-9)
@@ -637,10 +637,9 @@ def judged(outcome):
 
 
 def test_filters_on_presets_with_flicker(tmp_path):
-    result = flicker_in_filter.main(presets=("mpu-9250", "adis16470"), runs=24, duration=300.0, rate=20.0, out=tmp_path)
-    for outcome in result.outcomes:
-        judged(outcome)
-    blind = result.outcomes[0]
+    result = flicker_in_filter.main(presets=("mpu-9250",), runs=24, duration=300.0, rate=20.0, out=tmp_path)
+    (blind,) = result.outcomes
+    judged(blind)
     assert blind.anees["own"] > 1.0 + 3.0 * blind.scatter["own"]
     assert (tmp_path / "flicker.png").exists()
 
@@ -649,11 +648,3 @@ def test_filters_on_presets_with_flicker(tmp_path):
 @pytest.mark.parametrize("name", datasheets.PRESETS)
 def test_filters_on_presets_at_their_natural_rates(name):
     judged(flicker_in_filter.main(presets=(name,), runs=60, duration=600.0).outcomes[0])
-
-
-def test_the_sim_finds_the_spectra_of_its_specification(tmp_path):
-    result = simulate_imu.main(samples=1 << 16, out=tmp_path)
-    assert (tmp_path / "simulate_imu.png").exists()
-    assert set(result.worst) == {"angle random walk", "flicker", "rate random walk", "whole"}
-    # The largest of 50 bands, some of few lines whose χ² is skew.
-    assert all(1.0 < score < 5.0 for score in result.worst.values())

@@ -74,7 +74,7 @@ def test_a_log_of_messages_with_too_many_fields_is_refused(tmp_path, formats):
 
 
 def test_many_subscriptions_of_large_messages_come_to_an_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(ulog, "SECONDS", 0.5)
+    monkeypatch.setattr(ulog, "SECONDS", 0.1)
     path = tmp_path / "subscriptions.ulg"
     path.write_bytes(
         ULOG + block(b"F", b"sensor_combined:float[60000] x;") + 2000 * block(b"A", b"\0\0\0sensor_combined")
@@ -223,7 +223,7 @@ def test_reading_a_bag_takes_time_in_proportion_to_its_topics(tmp_path):
         return time.process_time() - begun
 
     bag(10)
-    assert bag(20_000) < 30.0 * max(bag(2_000), 0.02)
+    assert bag(10_000) < 30.0 * max(bag(1_000), 0.01)
 
 
 def test_a_written_mcap_has_checksums_and_damage_is_left_out(tmp_path):

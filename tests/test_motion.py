@@ -122,7 +122,17 @@ MOTIONS: dict[str, Motion] = {
     **TORQUE_FREE,
 }  # fmt: skip
 
-every_motion = pytest.mark.parametrize("truth", MOTIONS.values(), ids=MOTIONS.keys())
+DEFAULT = [name for name in MOTIONS if name not in TORQUE_FREE] + [
+    list(TORQUE_FREE)[k] for k in (0, 3, 7, 10, 12, 13, 14, 16, 17, 20, 21, 23, 25)
+]
+"""Of the bodies both regimes, the symmetric ones, spins about an axis, and the separatrix; the other orders of the axes are slow."""
+every_motion = pytest.mark.parametrize(
+    "truth",
+    [
+        pytest.param(truth, id=name, marks=() if name in DEFAULT else pytest.mark.slow)
+        for name, truth in MOTIONS.items()
+    ],
+)
 
 
 def breaks(truth: Motion) -> list[float]:
@@ -248,7 +258,7 @@ def test_attitude_is_the_integral_of_the_rate(truth):
 @every_motion
 def test_batch_shapes(truth):
     methods = (("attitude", 4), ("body_rate", 3), ("body_angular_acceleration", 3))
-    for shape, (method, width) in itertools.product([(), (1,), (7,), (2, 3), (0,)], methods):
+    for shape, (method, width) in itertools.product([(), (2, 3), (0,)], methods):
         t = np.random.default_rng(3).uniform(*RECORD, shape)
         values = getattr(truth, method)(t)
         assert values.shape == (*shape, width)
@@ -437,7 +447,13 @@ def test_torque_free_restarted_goes_on_as_before(truth):
     assert quaternion.angle_between(again.attitude(t), truth.attitude(1000.0 + t)).max() < 3e-12
 
 
-@pytest.mark.parametrize("name", list(TORQUE_FREE)[:14] + list(TORQUE_FREE)[20:21])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if k % 2 else ())
+        for k, name in enumerate([*list(TORQUE_FREE)[:14], list(TORQUE_FREE)[20]])
+    ],
+)
 def test_torque_free_after_a_hundred_thousand_periods(name):
     """After N periods of the rate (Landau and Lifshitz (37.12)) the body has turned about h by N times the advance of one.
 
@@ -486,7 +502,7 @@ def test_torque_free_increments_over_many_periods(truth):
 @pytest.mark.parametrize("complement", [1.0, 0.7, 0.1, 1e-3, 1e-8, 1e-20, 1e-40, 1e-300])
 def test_jacobi_functions_against_mpmath(complement):
     """Of the separatrix too, whose 1 − m is 1e-300; K and Π to 45 digits."""
-    with mpmath.workdps(330), localcontext(prec=DIGITS):
+    with mpmath.workdps(60 - math.floor(math.log10(complement))), localcontext(prec=DIGITS):
         exact, characteristic = mpmath.mpf(complement), mpmath.mpf("-0.3")
         first, third, means = torque_free.complete_integrals(Decimal(complement), Decimal("-0.3"))
         quarter = mpmath.ellipk(1 - exact)
@@ -568,8 +584,8 @@ def test_harmonic_attitude_against_mpmath():
             twice = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
             return [component / 2 for component in twice]
 
-        exact = mpmath.odefun(change, 0, [mpmath.mpf(x) for x in START], tol=mpmath.mpf(10) ** -19)(0.25)
-    assert np.abs(truth.attitude(0.25) - np.array([float(x) for x in exact])).max() < 5e-16
+        exact = mpmath.odefun(change, 0, [mpmath.mpf(x) for x in START], tol=mpmath.mpf(10) ** -19)(0.1)
+    assert np.abs(truth.attitude(0.1) - np.array([float(x) for x in exact])).max() < 5e-16
 
 
 def test_chained_nodes_keep_their_norm_without_normalisation():

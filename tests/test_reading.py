@@ -36,13 +36,6 @@ UNITS = {"gyro": "rad/s"}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    where = tmp_path_factory.mktemp("files")
-    targets(where)
-    return where
-
-
-@pytest.fixture(scope="module")
 def known(tmp_path_factory):
     return {target.name: target for target in targets(tmp_path_factory.mktemp("known"))}
 
@@ -82,17 +75,18 @@ def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):
     path = tmp_path / os.fsdecode(b"w\xff.csv")
     path.write_bytes(known["walk.csv"].content)
     assert len(recordings.read(path).time) == 20
-    _written(tmp_path / "again.h5", attributes={"note": str(path)})
+    with records.result_file(tmp_path / "again.h5", "record", {"note": str(path)}):
+        pass
     assert records.read_attributes(tmp_path / "again.h5")["note"] == str(tmp_path / "w\\udcff.csv")
     tuning = tmp_path / os.fsdecode(b"t\xff.json")
     tuning.write_bytes(known["tuning.json"].content)
     assert report.write(tuning).page.stat().st_size > 1000
 
 
-def _written(path, **more) -> Path:
+def _written(path) -> Path:
     increments = np.random.default_rng(2).standard_normal((2000, 3))
     origin = records.Origin(scenario=scenarios.load_scenario("two-stars"), seed=3)
-    recordfiles.write_record(path, ImuRecord(time=np.arange(2001.0), increments=increments, origin=origin), **more)
+    recordfiles.write_record(path, ImuRecord(time=np.arange(2001.0), increments=increments, origin=origin))
     return path
 
 
@@ -221,7 +215,7 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
 
     for _ in range(3):  # what else the machine does only adds to a time: one attempt within the bounds is enough
         took = []
-        for number in (25_000, 100_000) if unit == ",a" else (100_000, 400_000):  # columns take longest
+        for number in (12_500, 50_000) if unit == ",a" else (50_000, 200_000):  # columns take longest
             path.write_text(begin + unit * number + end)
             took.append(processor_seconds(refused))
         if took[1] < min(8.0 * took[0] + 0.5, 5.0):
@@ -232,11 +226,11 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
 
 def test_a_csv_of_many_columns_is_read(tmp_path):
     path = tmp_path / "wide.csv"
-    extra = 50_000
+    extra = 20_000
     rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
     path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
     captured = []
-    assert processor_seconds(lambda: captured.append(recordings.read(path))) < 3.0
+    assert processor_seconds(lambda: captured.append(recordings.read(path))) < 1.2
     assert captured[0].rate.shape == (3, 3)
 
 
@@ -347,29 +341,10 @@ def test_a_written_file_is_hdf5_to_others_with_its_digest_in_front(tmp_path):
         assert file.userblock_size == 512
         assert file.attrs["kind"].decode() == "strapdown record"
     long = "é" * 100_000
-    _written(tmp_path / "long.h5", attributes={"text": long, "empty": "", "list": ["a", "é", ""]})
+    with records.result_file(tmp_path / "long.h5", "record", {"text": long, "empty": "", "list": ["a", "é", ""]}):
+        pass
     held = records.read_attributes(tmp_path / "long.h5")
     assert [held[name] for name in ("text", "empty", "list")] == [long, "", ["a", "é", ""]]
-
-
-@pytest.mark.parametrize("name", ["record.h5", "estimate.h5", "campaign.h5"])
-def test_a_zeroed_sector_is_an_error_within_a_second_wherever_it_is(known, tmp_path, name):
-    content = known[name].content
-    path = tmp_path / name
-    sectors = range(512, len(content), 512)
-    for start in [*sectors[:20], *sectors[20::3], sectors[-1]]:
-        damaged = content[:start] + bytes(len(content[start : start + 512])) + content[start + 512 :]
-        if damaged == content:
-            continue
-        path.write_bytes(damaged)
-        begun = time.process_time()  # the library would loop, not wait
-        with pytest.raises(InputError, match=rf"{name} cannot be read: its content does not match its digest"):
-            known[name].read(path)
-        assert time.process_time() - begun < 1.0
-    for front in (bytes(512), bytes(512) + content[:512]):
-        path.write_bytes(front + content[512:])
-        with pytest.raises(InputError, match=rf"{name} is damaged: its digest is missing"):
-            known[name].read(path)
 
 
 def test_every_bit_counts(tmp_path):

@@ -238,26 +238,6 @@ def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
     assert np.isnan(read_truth.bias).all()
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path):
-    path = tmp_path / "estimate.h5"
-    write_estimate(path, estimate())
-    before = path.read_bytes()
-    with pytest.raises(TypeError):
-        write_estimate(path, dataclasses.replace(estimate(full=True), details={"place": object()}))
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["estimate.h5"]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
-def test_truncated_files_are_refused(tmp_path, share):
-    path = tmp_path / "estimate.h5"
-    write_estimate(path, estimate(full=True))
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(InputError, match=r"estimate\.h5 .*truncated"):
-        read_estimate(path)
-
-
 def test_foreign_files_are_refused(tmp_path):
     (tmp_path / "text.h5").write_text("time,gx\n0,1\n")
     with h5py.File(tmp_path / "other.h5", "w") as file:

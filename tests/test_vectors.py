@@ -70,7 +70,7 @@ def test_noise_has_the_sigma_that_the_series_states(sensor):
     """Beside it noise so quick that it is white, of twice the σ, in the same unit."""
     size = 2.0 * getattr(sensor, "sigma", 1e-4)
     quick = dataclasses.replace(sensor, faults=Faults(correlated_sigma=size, correlation_time=1e-6))
-    series = observe(quick, body=motion.rest(), end=5000.0)
+    series = observe(quick, body=motion.rest(), end=2000.0)
     n, ratio = len(series.time), 2.0 * np.ones(3)
     if series.kind == "attitude":
         score, ratio = quaternion.log(series.attitude) / series.sigma_axes, size / sensor.sigma_axes
@@ -133,12 +133,12 @@ def test_correlated_noise_is_a_stationary_first_order_process():
         Magnetometer(name="m", field_f=FIELD, sigma=0.0, rate=1.0, kind="vector", faults=faults).observe(
             motion.rest(), 0.0, 20.0, generator(1, run, "m")
         )
-        for run in range(800)
+        for run in range(300)
     ]
     noise = np.array([s.vector_b - FIELD for s in series]).transpose(1, 0, 2).reshape(20, -1)
-    assert np.all(np.abs(np.mean(noise**2, axis=1) / 9e-14 - 1.0) < 5.0 * math.sqrt(2.0 / 2400))
+    assert np.all(np.abs(np.mean(noise**2, axis=1) / 9e-14 - 1.0) < 5.0 * math.sqrt(2.0 / 900))
     for lag in (1, 5, 10):
-        assert np.mean(noise[0] * noise[lag]) / 9e-14 == pytest.approx(math.exp(-lag / 5.0), abs=5.0 / math.sqrt(2400))
+        assert np.mean(noise[0] * noise[lag]) / 9e-14 == pytest.approx(math.exp(-lag / 5.0), abs=5.0 / math.sqrt(900))
 
 
 def test_hard_and_soft_iron():

@@ -28,6 +28,7 @@ from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.parameters import MOTIONS, of_motion
 from strapdown.checks import InputError, instance, one_of, positive
 from strapdown.codegen import c, design, javascript
+from strapdown.codegen.target import traced
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
 from strapdown.files import atomic_write, usable_folder, writable
 from strapdown.records import ImuRecord
@@ -108,14 +109,15 @@ def export(
     elif not isinstance(setup, FilterSetup | LiveAhrs):
         setup = read_setup(setup)
     usable_folder("folder", folder)
+    single = precision == "single"
     if isinstance(setup, LiveAhrs):
         if sensors is not None:
             raise InputError("sensors are given, but the filter of an IMU has its own; leave them out")
-        program = design.program_of_live(setup, single=precision == "single")
+        program = design.program_of_live(setup, single=single)
     else:
-        program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
-    origin = _origin(setup, precision)
-    texts = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
+        program = design.program_of(setup, _sensors_of(sensors), single=single)
+    source = program, traced(program), _origin(setup, precision)
+    texts = c.files(*source, single=single) if to == "c" else javascript.files(*source)
     paths = [Path(folder) / name for name in texts]
     writable("folder", *paths)
     for path, text in zip(paths, texts.values(), strict=True):

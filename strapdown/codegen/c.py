@@ -8,11 +8,13 @@ import textwrap
 
 import numpy as np
 
-from strapdown.codegen.program import Program, Sensor
-from strapdown.codegen.target import Target, traced
+from strapdown.codegen.program import Program, Sensor, place
+from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 
 PUBLIC = ("init", "predict")
+SMALLEST = float(np.finfo(np.float32).tiny)
+"""Smallest number with all its digits in single precision."""
 TYPES = {"": "strapdown_real", "int": "int", "wide": "double", "status": "unsigned"}
 
 
@@ -21,6 +23,8 @@ def _number(x: float, single: bool) -> str:
         return "INFINITY" if x > 0.0 else "-INFINITY"
     if not single:
         return repr(x)
+    if 0.0 < abs(x) < SMALLEST:  # a bound that keeps a divisor from zero
+        x = math.copysign(SMALLEST, x)
     text = str(np.float32(x))
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
@@ -136,59 +140,56 @@ def header(program: Program, functions: list[Target], origin: str, *, single: bo
         head = signature(function)
         if not head.startswith("static"):
             out += ["/*", wrapped(function.words), " */", f"{head};", ""]
-    for words, head in ACCESSORS:
+    for words, head, _ in accessors(program, single=single):
         out += [f"/* {words} */", f"{head};", ""]
     out += ["#ifdef __cplusplus", "}", "#endif", "", "#endif", ""]
     return "\n".join(out)
 
 
-ACCESSORS = (
-    ("Attitude q_fb, scalar first.", "void strapdown_attitude(const strapdown_filter *f, strapdown_real q[4])"),
-    (
-        "Whole gyro bias, rad/s, body axes, with the contributions of error states.",
-        "void strapdown_bias(const strapdown_filter *f, strapdown_real bias[3])",
-    ),
-    (
-        "Standard deviations of the errors: attitude (rad, body axes), bias (rad/s), error states.",
-        "void strapdown_sigma(const strapdown_filter *f, strapdown_real sigma[STRAPDOWN_STATES])",
-    ),
-    (
-        "Last normalised innovation squared of a sensor.",
-        "strapdown_real strapdown_nis(const strapdown_filter *f, int sensor)",
-    ),
-    ("Flags since the last strapdown_clear_status.", "unsigned strapdown_status(const strapdown_filter *f)"),
-    ("Clear the flags.", "void strapdown_clear_status(strapdown_filter *f)"),
-)
-
-
 def diagonal(n: int) -> list[int]:
     """Return the places of the variances in P."""
-    return [i * n - i * (i - 1) // 2 for i in range(n)]
+    return [place(n, i, i) for i in range(n)]
 
 
-def accessors(program: Program, *, single: bool) -> list[str]:
-    """Return the functions that read the filter."""
+def accessors(program: Program, *, single: bool) -> list[tuple[str, str, list[str]]]:
+    """Return comment, head and lines of the functions that read the filter."""
     words = language(single=single)
     attitude = "attitude" if program.recording is None else "q"
-    bodies: list[list[str]] = [[f"q[{i}] = f->{attitude}[{i}];" for i in range(4)]]
-    bodies.append([f"bias[{i}] = {whole_bias(program, i, words)};" for i in range(3)])
     places = ", ".join(map(str, diagonal(program.n)))
-    sigma = "f->P[places[i]]" if program.recording is None else "i < 6 ? f->variance[i] : f->P[places[i]]"
-    bodies.append(
-        [
-            f"static const unsigned short places[STRAPDOWN_STATES] = {{{places}}};",
-            "for (int i = 0; i < STRAPDOWN_STATES; i++) {",
-            f"    sigma[i] = {words.function('sqrt')}({sigma});",
-            "}",
-        ]
-    )
-    bodies.append(["return f->nis[sensor];"])
-    bodies.append(["return f->status;"])
-    bodies.append(["f->status = 0;"])
-    out = []
-    for (_, head), lines in zip(ACCESSORS, bodies, strict=True):
-        out += [f"{head} {{", *(f"    {line}" for line in lines), "}", ""]
-    return out
+    variance = "f->P[places[i]]" if program.recording is None else "i < 6 ? f->variance[i] : f->P[places[i]]"
+    return [
+        (
+            "Attitude q_fb, scalar first.",
+            "void strapdown_attitude(const strapdown_filter *f, strapdown_real q[4])",
+            [f"q[{i}] = f->{attitude}[{i}];" for i in range(4)],
+        ),
+        (
+            "Whole gyro bias, rad/s, body axes, with the contributions of error states.",
+            "void strapdown_bias(const strapdown_filter *f, strapdown_real bias[3])",
+            [f"bias[{i}] = {whole_bias(program, i, words)};" for i in range(3)],
+        ),
+        (
+            "Standard deviations of the errors: attitude (rad, body axes), bias (rad/s), error states.",
+            "void strapdown_sigma(const strapdown_filter *f, strapdown_real sigma[STRAPDOWN_STATES])",
+            [
+                f"static const unsigned short places[STRAPDOWN_STATES] = {{{places}}};",
+                "for (int i = 0; i < STRAPDOWN_STATES; i++) {",
+                f"    sigma[i] = {words.function('sqrt')}({variance});",
+                "}",
+            ],
+        ),
+        (
+            "Last normalised innovation squared of a sensor.",
+            "strapdown_real strapdown_nis(const strapdown_filter *f, int sensor)",
+            ["return f->nis[sensor];"],
+        ),
+        (
+            "Flags since the last strapdown_clear_status.",
+            "unsigned strapdown_status(const strapdown_filter *f)",
+            ["return f->status;"],
+        ),
+        ("Clear the flags.", "void strapdown_clear_status(strapdown_filter *f)", ["f->status = 0;"]),
+    ]
 
 
 def whole_bias(program: Program, axis: int, words: Language) -> str:
@@ -215,7 +216,9 @@ def source(program: Program, functions: list[Target], origin: str, *, single: bo
             "}",
             "",
         ]
-    return "\n".join(out + accessors(program, single=single))
+    for _, head, lines in accessors(program, single=single):
+        out += [f"{head} {{", *(f"    {line}" for line in lines), "}", ""]
+    return "\n".join(out)
 
 
 def example(program: Program) -> str:
@@ -302,9 +305,8 @@ target_link_libraries(strapdown_example strapdown_filter)
 """
 
 
-def files(program: Program, origin: str, *, single: bool) -> dict[str, str]:
+def files(program: Program, functions: list[Target], origin: str, *, single: bool) -> dict[str, str]:
     """Return the files of the filter by name."""
-    functions = traced(program)
     return {
         "strapdown_filter.h": header(program, functions, origin, single=single),
         "strapdown_filter.c": source(program, functions, origin, single=single),

@@ -204,13 +204,6 @@ class Function:
             assert body is not None
             self.inside(block, body)
 
-    def unless(self, condition: Any, body: Callable[[], None]) -> None:
-        """Execute a body if a condition does not hold, also if it involves a NaN."""
-        if isinstance(condition, Symbol):
-            self.branch(self.trace.symbol("not", condition), body)
-        elif not condition:
-            body()
-
     def leave_loop(self) -> None:
         """Leave the innermost loop."""
         self.flush()
@@ -230,12 +223,7 @@ class Function:
             array.forget()
         return value
 
-    def leave(self, status: str) -> None:
-        """Return a status."""
+    def give(self, value: Any, status: str = "") -> None:
+        """Return a number, nothing, or a status."""
         self.flush()
-        self.add(Statement("return", status))
-
-    def give(self, value: Any) -> None:
-        """Return a number, or nothing."""
-        self.flush()
-        self.add(Statement("return", values=() if value is None else (value,)))
+        self.add(Statement("return", status, values=() if value is None else (value,)))

@@ -187,6 +187,8 @@ class Interpreter:
         """What is called by these names, on symbols."""
         self.own, self.replaced = own, replaced
         """Functions that become functions of the target; functions that are executed instead of others of the same names."""
+        self.scopes: dict[ast.expr, dict[str, Any]] = {}
+        """Functions and constants that an expression names, by name."""
         self.outer = False
         """Whether the kernel is the function of the target, which may return anywhere."""
         self.loops = True
@@ -230,14 +232,12 @@ class Interpreter:
     def _value(self, node: ast.expr, env: dict[str, Any]) -> Any:
         """Return the value of an expression."""
         code, used = code_of(node)
-        names = {}
-        for name in used:
-            if name in env:
-                names[name] = env[name]
-            elif name in self.helpers:
-                names[name] = self.helpers[name]
-            elif name in env["_globals_"]:
-                names[name] = executed(self.replaced.get(name, env["_globals_"][name]), self)
+        if node not in self.scopes:
+            module = {name: value for name, value in env["_globals_"].items() if name in used}
+            module |= {name: value for name, value in self.replaced.items() if name in module}
+            helpers = {name: value for name, value in self.helpers.items() if name in used}
+            self.scopes[node] = {name: executed(value, self) for name, value in module.items()} | helpers
+        names = self.scopes[node] | {name: env[name] for name in used if name in env}
         try:
             return eval(code, names)
         except Exception as error:
@@ -250,6 +250,8 @@ class Interpreter:
         """Execute statements; return the value returned by them in a tuple, or an empty one."""
         while items:
             node = items.pop(0)
+            if isinstance(node, ast.Return):
+                return (None if node.value is None else self._value(node.value, env),)
             if isinstance(node, Bind):
                 self._assign(node.target, node.value, env)
             elif isinstance(node, ast.Assign | ast.AnnAssign):
@@ -262,8 +264,6 @@ class Interpreter:
             elif isinstance(node, ast.Expr):
                 if not isinstance(node.value, ast.Constant):
                     self._value(node.value, env)
-            elif isinstance(node, ast.Return):
-                return (None if node.value is None else self._value(node.value, env),)
             elif isinstance(node, ast.Continue):
                 return ()
             elif isinstance(node, ast.While):
@@ -417,7 +417,7 @@ class Interpreter:
                 array.forget()
             here = env | {name: variable.value() for name, variable in variables.items()}
             for condition in conditions:
-                m.unless(self._value(condition, here), m.leave_loop)
+                m.branch(self.helpers["_no_"](self._value(condition, here)), m.leave_loop)
             if counter is not None:
                 here[counter[0]] = counter[1]
             result = self._statements(list(body), here)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from strapdown.codegen.c import TYPES, constant_of, diagonal, is_public, may_be_missing, members, whole_bias, wrapped
 from strapdown.codegen.program import Program
-from strapdown.codegen.target import Target, traced
+from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 
 LANGUAGE = Language(
@@ -29,7 +29,7 @@ def head(function: Target) -> str:
     return f"{'export ' if is_public(function) else ''}function {function.name}({', '.join(parameters)})"
 
 
-def files(program: Program, origin: str) -> dict[str, str]:
+def files(program: Program, functions: list[Target], origin: str) -> dict[str, str]:
     """Return the files of the filter by name."""
     out = ["/*", wrapped(origin), " */", ""]
     out.append("/** Status of a call, and flags in the filter's status. */")
@@ -42,7 +42,7 @@ def files(program: Program, origin: str) -> dict[str, str]:
     for name, size, words, _ in members(program):
         out.append(f"        {name}: {f'new Float64Array({size})' if size else '0'}, // {words}")
     out += ["        status: 0,", "    };", "}", ""]
-    for function in traced(program):
+    for function in functions:
         out += [
             f"/*\n{wrapped(function.words)}\n */",
             f"{head(function)} {{",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -39,11 +40,6 @@ def symbols_of(values: Iterable[Any]) -> Iterator[Symbol]:
             yield from symbols_of(value)
 
 
-def operands_of(symbol: Symbol) -> Iterator[Symbol]:
-    """Return the symbols on which a symbol depends."""
-    yield from symbols_of(symbol.operands)
-
-
 def blocks_of(block: Block) -> Iterator[Block]:
     """Return a block and all inside it."""
     yield block
@@ -71,14 +67,14 @@ class Placement:
         self.blocks: dict[Block, Slot] = {}
         self._add_blocks(function.body, None)
         self.alive = self._alive(function.body)
-        self.groups: dict[Symbol, Group] = {}
+        self.groups = self._grouped()
         self._place(function.body)
-        sizes = self._sizes()
+        sizes = collections.Counter(self.places[symbol] for symbol in self.alive)
         for symbol, group in list(self.groups.items()):
             assert group.arms is not None
-            if sum(sizes.get(arm, 0) for arm in group.arms) < WORTH_A_BRANCH:
+            if sum(sizes[arm] for arm in group.arms) < WORTH_A_BRANCH:
                 del self.groups[symbol]
-        self._place(function.body, keep=True)
+        self._place(function.body)
         branches = ((x, slot) for block, slot in self.blocks.items() for x in block.statements if x.kind == "if")
         self.conditions = [x.values[0] for x, slot in branches if self.places.get(x.values[0]) is slot]
         """Conditions of statements ``if`` that are computed in the block of the statement."""
@@ -104,23 +100,20 @@ class Placement:
             symbol = waiting.pop()
             if symbol not in known:
                 known.add(symbol)
-                for operand in operands_of(symbol):
+                for operand in symbols_of(symbol.operands):
                     self.uses[operand] = self.uses.get(operand, 0) + 1
                     waiting.append(operand)
         return sorted(known, key=lambda symbol: symbol.number)
 
-    def _grouped(self) -> None:
-        """Group the live selections."""
-        groups: dict[tuple[Any, int], Group] = {}
-        for symbol in self.alive:
-            if symbol.kind == "select":
-                group = groups.setdefault((symbol.operands[0], symbol.run), Group())
-                group.members.append(symbol)
-                self.groups[symbol] = group
+    def _grouped(self) -> dict[Symbol, Group]:
+        """Return the group of each live selection."""
+        groups: dict[tuple[Any, int], Group] = collections.defaultdict(Group)
+        selections = [symbol for symbol in self.alive if symbol.kind == "select"]
+        for symbol in selections:
+            groups[symbol.operands[0], symbol.run].members.append(symbol)
+        return {symbol: groups[symbol.operands[0], symbol.run] for symbol in selections}
 
-    def _place(self, body: Block, *, keep: bool = False) -> None:
-        if not keep:
-            self._grouped()
+    def _place(self, body: Block) -> None:
         places: dict[Symbol, Slot] = {}
 
         def use(value: Any, slot: Slot) -> None:
@@ -136,12 +129,9 @@ class Placement:
         for symbol in reversed(self.alive):
             if symbol.kind in PINNED:
                 places[symbol] = self.blocks[symbol.place]
-                for operand in operands_of(symbol):
-                    use(operand, places[symbol])
-                continue
             group = self.groups.get(symbol)
             if group is None:
-                for operand in operands_of(symbol):
+                for operand in symbols_of(symbol.operands):
                     use(operand, places[symbol])
                 continue
             if group.slot is None:
@@ -158,13 +148,6 @@ class Placement:
             use(b, group.arms[1])
         self.places = places
 
-    def _sizes(self) -> dict[Slot, int]:
-        sizes: dict[Slot, int] = {}
-        for symbol in self.alive:
-            place = self.places[symbol]
-            sizes[place] = sizes.get(place, 0) + 1
-        return sizes
-
     def needed(self, values: Iterable[Any], slot: Slot, written: set[Symbol]) -> list[Symbol]:
         """Return the symbols of a slot that are needed for values and not yet written, in order."""
         waiting, visited = list(symbols_of(values)), set()
@@ -172,7 +155,7 @@ class Placement:
             symbol = waiting.pop()
             if symbol not in visited and symbol not in written:
                 visited.add(symbol)
-                waiting.extend(operands_of(symbol))
+                waiting.extend(symbols_of(symbol.operands))
         return sorted((x for x in visited if self.places[x] is slot), key=lambda symbol: symbol.number)
 
 

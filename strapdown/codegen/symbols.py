@@ -21,10 +21,10 @@ class Symbol:
     __array_ufunc__ = None
     """Operations with NumPy arrays are refused, not applied to each element."""
 
-    def __init__(self, trace: Trace, kind: str, operands: tuple[Any, ...], number: int, run: int) -> None:
+    def __init__(self, trace: Trace, kind: str, operands: tuple[Any, ...], result: str, number: int, run: int) -> None:
         self.trace, self.kind, self.operands, self.number, self.run = trace, kind, operands, number, run
         self.place = trace.place
-        self.type = type_of(kind, operands)
+        self.type = result
         """``"int"``, ``"wide"`` (of times, which are double in single precision too), or ``""``."""
 
     def __bool__(self) -> bool:
@@ -94,17 +94,17 @@ class Symbol:
 
 def type_of(kind: str, operands: tuple[Any, ...]) -> str:
     """Return the type of an operation's result. The difference of two times as they are stored is a duration, of the usual type."""
-    symbols = [x for x in operands if isinstance(x, Symbol)]
+    if kind in PINNED:
+        return ""
     if kind in (*CONDITIONS, "trunc"):
         return "int"
-    if any(x.type == "wide" for x in symbols) and kind not in PINNED:
-        stored = len(symbols) == 2 and all(x.type == "wide" and x.kind in PINNED for x in symbols)
+    types = [x.type if isinstance(x, Symbol) else "int" if isinstance(x, int) else "" for x in operands]
+    if "wide" in types:
+        stored = types == ["wide", "wide"] and all(x.kind in PINNED for x in operands)
         return "" if kind == "-" and stored else "wide"
-    if kind not in INTEGER:
-        return ""
-    operands = operands[1:] if kind == "select" else operands
-    whole = (x.type == "int" if isinstance(x, Symbol) else isinstance(x, int) for x in operands)
-    return "int" if all(whole) else ""
+    if kind == "select":
+        del types[0]
+    return "int" if kind in INTEGER and "" not in types else ""
 
 
 INTEGER = ("+", "-", "*", "neg", "//", "%", "|", "select")
@@ -132,14 +132,15 @@ class Trace:
 
     def symbol(self, kind: str, *operands: Any) -> Symbol:
         """Return the symbol of an operation."""
-        key = (kind, type_of(kind, operands), *operands)
+        result = type_of(kind, operands)
+        key = (kind, result, *operands)
         known = self.symbols.get(key)
         if known is None:
             group = (operands[0],) if kind == "select" else ()
             members = any(isinstance(x, Symbol) and x.kind == "select" and x.run == self.run for x in operands)
             if group != self.group or not group or members:
                 self.run, self.group = self.run + 1, group
-            known = self.symbols[key] = Symbol(self, kind, operands, self.count(), self.run)
+            known = self.symbols[key] = Symbol(self, kind, operands, result, self.count(), self.run)
         return known
 
     def sum(self, a: Any, b: Any) -> Any:

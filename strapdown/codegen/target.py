@@ -87,12 +87,11 @@ class Target(Function):
         size = m.kernel.trace_function(function, arguments)
         self.functions[name] = m, size
 
-    def give(self, value: Any) -> None:
-        """Return a number, nothing, or a status."""
+    def give(self, value: Any, status: str = "") -> None:
+        """Return a number, nothing, or a status, which may be known by its bit."""
         if self.returns == "status" and not isinstance(value, Symbol):
-            self.leave(next(name for name, (bit, _) in self.program.statuses.items() if bit == value))
-        else:
-            super().give(value)
+            value, status = None, next(name for name, (bit, _) in self.program.statuses.items() if bit == value)
+        super().give(value, status)
 
     def _far_turn(self, phi: Any) -> tuple[Any, Any]:
         if "far_turn" not in self.functions:

@@ -35,22 +35,14 @@ _SERIES = {
     "covariance": "the square of sigma's",
     "arrival": "s",
 }
-_RESERVED = ("kind", "format", "version", "conventions", "gyro", "scenario", "seed", "run", "source")
 
 
-def write_record(
-    path: str | os.PathLike[str], record: ImuRecord, *, attributes: Mapping[str, Any] | None = None
-) -> None:
+def write_record(path: str | os.PathLike[str], record: ImuRecord) -> None:
     """Write a record to HDF5, with its origin; the file is created only when complete.
 
-    A scenario with a Python function or a user-defined class cannot be written to a file and is left out. ``attributes`` are additional
-    attributes of the file.
+    A scenario with a Python function or a user-defined class cannot be written to a file and is left out.
     """
-    for name in attributes or {}:
-        if name in _RESERVED:
-            raise InputError(f"attributes has {name!r}, which is reserved by the file; choose another name")
-    with result_file(path, "record", {"format": FORMAT}) as file:
-        set_attributes(file, {**origin_attributes(record.origin), **(attributes or {})})
+    with result_file(path, "record", {"format": FORMAT, **origin_attributes(record.origin)}) as file:
         put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
         put(
             file,

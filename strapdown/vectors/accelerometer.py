@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, array, one_of
-from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors.measurements import Kind, direction
-from strapdown.vectors.sensor import Faults, Sampled, check_sampling, in_body, unit_vector
+from strapdown.vectors.sensor import Sampled, in_body, unit_vector
 
 if TYPE_CHECKING:
     from strapdown.motion import Motion
@@ -67,17 +66,15 @@ def specific_force(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Accelerometer(Sampled, ByValue):
+class Accelerometer(Sampled):
     """An accelerometer used as a sensor of the vertical: correct at rest, otherwise in error by the acceleration of the body.
 
     Parameters
     ----------
-    name : str
+    name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     sigma : float
         Noise of each component, m/s².
-    rate : float
-        Measurements per second, Hz.
     lever_arm_b : ndarray (3,), default zeros
         Position on the body, m, from the point that moves with ``acceleration_f``.
     bias : ndarray (3,), default zeros
@@ -88,24 +85,18 @@ class Accelerometer(Sampled, ByValue):
         Acceleration of gravity, m/s², fixed frame.
     kind : {"direction", "vector"}, default "direction"
         ``"direction"`` (of the vertical) or ``"vector"`` (the specific force, m/s²).
-    phase, faults : float, Faults
-        As for :class:`VectorSensor`.
     """
 
-    name: str
     sigma: float
-    rate: float
     lever_arm_b: Array = field(default_factory=lambda: np.zeros(3))
     bias: Array = field(default_factory=lambda: np.zeros(3))
     acceleration_f: Callable[[Array], Array] | None = None
     gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
     kind: Kind = "direction"
-    phase: float = 0.0
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
-        check_sampling(self.name, self.sigma, "m/s²", self.rate, self.phase)
+        self._check_sampling(self.sigma, "m/s²")
         one_of(f"{self.name}: kind", self.kind, ("direction", "vector"))
         for name in ("lever_arm_b", "bias", "gravity_f"):
             object.__setattr__(self, name, array(f"{self.name}: {name}", getattr(self, name), (3,)))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, non_negative, numbers, one_of, unit_quaternions
-from strapdown.vectors.sensor import Faults, Sampled, attitude_of, check_sampling
+from strapdown.vectors.sensor import Sampled, attitude_of
 
 Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
 
@@ -40,38 +40,30 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
     return "xyz"[k] if abs(b[k]) > 1.0 - 1e-12 else tuple(b.tolist())
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AttitudeSensor(Sampled):
     """A star tracker that measures the attitude as a quaternion; less precise about its boresight than across it.
 
     Parameters
     ----------
-    name : str
+    name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     sigma_across : float
         Noise about the two axes across the boresight, rad.
     sigma_about : float
         Noise about the boresight, rad.
-    rate : float
-        Measurements per second, Hz.
     boresight : {"x", "y", "z"} or array_like (3,), (4,) or (3, 3), default "z"
         Boresight: a body axis, a direction in body axes (3,), or the mounting, sensor to body, as a quaternion (4,), scalar first,
         or a rotation matrix (3, 3), whose z axis is the boresight. Stored as an axis or a unit vector.
-    phase, faults : float, Faults
-        As for :class:`VectorSensor`.
     """
 
-    name: str
     sigma_across: float
     sigma_about: float
-    rate: float
     boresight: Boresight = "z"
-    phase: float = 0.0
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
-        check_sampling(self.name, self.sigma_across, "rad", self.rate, self.phase)
+        self._check_sampling(self.sigma_across, "rad")
         non_negative(f"{self.name}: sigma_about", self.sigma_about, unit="rad")
         object.__setattr__(self, "boresight", _boresight(f"{self.name}: boresight", self.boresight))
 

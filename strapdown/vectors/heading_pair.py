@@ -2,46 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, array
-from strapdown.results import ByValue
 from strapdown.vectors.measurements import direction
-from strapdown.vectors.sensor import Faults, Sampled, attitude_of, check_sampling, unit_vector
+from strapdown.vectors.sensor import Sampled, attitude_of, unit_vector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HeadingPair(Sampled, ByValue):
+class HeadingPair(Sampled):
     """Two GNSS antennas on the body: the heading of the line between them.
 
     The line is known in the body and measured in the fixed frame, so ``vector_b`` is exact and ``reference_f`` (m, 3) has the noise.
 
     Parameters
     ----------
-    name : str
+    name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     baseline_b : ndarray (3,)
         Vector from the first antenna to the second, m, body axes.
     sigma : float
         Noise of each component of the relative position, m; that of the heading is this divided by the baseline's horizontal length.
-    rate, phase, faults : float, float, Faults
-        As for :class:`VectorSensor`.
     """
 
-    name: str
     baseline_b: Array
     sigma: float
-    rate: float
-    phase: float = 0.0
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
-        check_sampling(self.name, self.sigma, "m", self.rate, self.phase)
+        self._check_sampling(self.sigma, "m")
         object.__setattr__(self, "baseline_b", array(f"{self.name}: baseline_b", self.baseline_b, (3,)))
         direction(f"{self.name}: baseline_b", self.baseline_b)
 

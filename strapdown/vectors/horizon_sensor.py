@@ -2,47 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from strapdown.checks import Array, instance
-from strapdown.results import ByValue
-from strapdown.vectors.sensor import Faults, Sampled, check_sampling, in_body, unit_vector
+from strapdown.vectors.sensor import Sampled, in_body, unit_vector
 
 if TYPE_CHECKING:
     from strapdown.motion.orbit import CircularOrbit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HorizonSensor(Sampled, ByValue):
+class HorizonSensor(Sampled):
     """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame.
 
     Parameters
     ----------
-    name : str
+    name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     orbit : CircularOrbit
         Orbit of the body, in the fixed frame.
     sigma : float
         Noise of each component of the unit direction, rad.
-    rate, phase, faults : float, float, Faults
-        As for :class:`VectorSensor`.
     """
 
-    name: str
     orbit: CircularOrbit
     sigma: float
-    rate: float
-    phase: float = 0.0
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
         from strapdown.motion.orbit import CircularOrbit  # imports all motions, which recordings do not need
 
-        check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
+        self._check_sampling(self.sigma, "rad")
         instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:

@@ -9,48 +9,39 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.results import ByValue
 from strapdown.vectors.measurements import Kind
-from strapdown.vectors.sensor import Faults, Sampled, check_sampling, in_body, unit_vector
+from strapdown.vectors.sensor import Sampled, in_body, unit_vector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Magnetometer(Sampled, ByValue):
+class Magnetometer(Sampled):
     """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the residual of the calibration).
 
     Parameters
     ----------
-    name : str
+    name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     field_f : ndarray (3,) or callable
         Magnetic field, T, fixed frame; or a function of time (m,), s, that returns it (m, 3).
     sigma : float
         Noise of each component, T.
-    rate : float
-        Measurements per second, Hz.
     hard_iron : ndarray (3,), default zeros
         Hard iron h: field of magnetised parts that move with the body, T, body axes.
     soft_iron : ndarray (3, 3), default zeros
         Soft iron S: effect of parts magnetised by the external field, dimensionless.
     kind : {"direction", "heading", "vector"}, default "direction"
         ``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (the whole field, T).
-    phase, faults : float, Faults
-        As for :class:`VectorSensor`.
     """
 
-    name: str
     field_f: Array | Callable[[Array], Array]
     sigma: float
-    rate: float
     hard_iron: Array = field(default_factory=lambda: np.zeros(3))
     soft_iron: Array = field(default_factory=lambda: np.zeros((3, 3)))
     kind: Kind = "direction"
-    phase: float = 0.0
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
-        check_sampling(self.name, self.sigma, "T", self.rate, self.phase)
+        self._check_sampling(self.sigma, "T")
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
         if not callable(self.field_f):
             object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, finite, non_negative, positive
 from strapdown.kernels import gyro_errors
 from strapdown.kernels.machine import compiled
+from strapdown.results import ByValue
 from strapdown.vectors.measurements import VectorMeasurements
 
 
@@ -139,13 +140,6 @@ def sample_times(rate: float, phase: float, start: float, end: float) -> Array:
     return np.minimum(first + np.arange(skipped, max(number, 0) + skipped) / rate, end)
 
 
-def check_sampling(name: str, sigma: float, unit: str, rate: float, phase: float) -> None:
-    """Refuse a negative noise, rate or phase."""
-    non_negative(f"{name}: sigma", sigma, unit=unit)
-    positive(f"{name}: rate", rate, unit="Hz")
-    non_negative(f"{name}: phase", phase, unit="s")
-
-
 def attitude_of(motion: Any, time: Array) -> Array:
     """Return q_fb of a motion, which may be given as a function of time."""
     return np.asarray(motion(time) if callable(motion) else motion.attitude(time))
@@ -156,13 +150,20 @@ def in_body(motion: Any, time: Array, vector_f: Array) -> Array:
     return quaternion.rotate(quaternion.conjugate(attitude_of(motion, time)), vector_f)
 
 
-class Sampled:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sampled(ByValue):
     """A sensor with its own rate and faults; :meth:`_measured` of the class returns its measurements."""
 
     name: str
     rate: float
-    phase: float
-    faults: Faults
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def _check_sampling(self, sigma: float, unit: str) -> None:
+        """Refuse a negative noise, rate or phase."""
+        non_negative(f"{self.name}: sigma", sigma, unit=unit)
+        positive(f"{self.name}: rate", self.rate, unit="Hz")
+        non_negative(f"{self.name}: phase", self.phase, unit="s")
 
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
         """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""

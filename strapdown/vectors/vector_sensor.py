@@ -11,37 +11,36 @@ whole vector (kind ``"vector"``), whose noise is the same in all components.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from strapdown.checks import Array, one_of
-from strapdown.results import ByValue
 from strapdown.vectors.measurements import Kind, direction
-from strapdown.vectors.sensor import Faults, Sampled, check_sampling, in_body, unit_vector
+from strapdown.vectors.sensor import Sampled, in_body, unit_vector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VectorSensor(Sampled, ByValue):
+class VectorSensor(Sampled):
     """A sensor of one known direction: a star, the sun, a beacon.
 
     Parameters
     ----------
     name : str
         Name of the sensor and of its stream of random numbers.
-    reference_f : ndarray (3,)
-        Direction measured, fixed frame; it is normalised.
-    sigma : float
-        Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes.
     rate : float
         Measurements per second, Hz.
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
-    kind : {"direction", "heading"}, default "direction"
-        ``"direction"``, or ``"heading"`` (only the rotation about the fixed z axis).
     faults : Faults, default no faults
         Errors beyond the white noise.
+    reference_f : ndarray (3,)
+        Direction measured, fixed frame; it is normalised.
+    sigma : float
+        Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes.
+    kind : {"direction", "heading"}, default "direction"
+        ``"direction"``, or ``"heading"`` (only the rotation about the fixed z axis).
 
     Examples
     --------
@@ -50,18 +49,14 @@ class VectorSensor(Sampled, ByValue):
     [0.6 0.  0.8]
     """
 
-    name: str
     reference_f: Array
     sigma: float
-    rate: float
-    phase: float = 0.0
     kind: Kind = "direction"
-    faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
         """Check every field."""
         object.__setattr__(self, "reference_f", direction(f"{self.name}: reference_f", self.reference_f))
-        check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
+        self._check_sampling(self.sigma, "rad")
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
