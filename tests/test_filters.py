@@ -525,6 +525,23 @@ def test_each_sensor_has_its_own_gains():
         np.testing.assert_array_equal(*(getattr(estimate, part) for estimate in estimates))
 
 
+def test_mahony_learns_a_constant_bias_with_its_default_gains():
+    """At rest under two vectors the bias error falls with time: a gain of the wrong sign would let it grow."""
+    n, bias = 6000, np.array([4e-3, -3e-3, 5e-3])
+    time = np.arange(n + 1) / 10.0
+    vectors = tuple(
+        series_of(name, "direction", time[1:], np.tile(r, (n, 1)), r, 0.01)
+        for name, r in (("up", [0.0, 0.0, 1.0]), ("north", [1.0, 0.0, 0.0]))
+    )
+    record = ImuRecord(time=time, increments=np.tile(bias / 10.0, (n, 1)), vectors=vectors)
+    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.01, bias_sigma=0.01)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+    off = np.linalg.norm(filters.run("mahony", record, noise, initial).bias - bias, axis=1) / np.linalg.norm(bias)
+    assert off[0] == 1.0
+    assert 0.0 < off[n // 10] < 0.5
+    assert off[-1] < 1e-3
+
+
 @pytest.mark.parametrize(("kind", "form"), SHARPEST)
 def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
     """``ω_mes = M δθ + n``: M by differences of the truth, Cov n by differences of the measurement."""
