@@ -757,7 +757,7 @@ def assert_sound(estimate):
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["few", "thousands"])
 @pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_filter_stays_finite_from_any_start(name, many):
-    for seed in range(100, 3000) if many else range(24):
+    for seed in range(100, 3000) if many else range(16):
         record, initial = wild(seed, 2000 if many else 300)
         assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
