@@ -283,7 +283,7 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
 # ----------------------------------------------------------------------------------------------------------- never worse, the ends
 
 
-def test_last_state_is_the_filters() -> None:
+def test_last_state_is_the_filters_and_without_measurements_each_is() -> None:
     case = CASES["asynchronous"]
     record, initial = simulated(case, np.random.default_rng(7))
     smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
@@ -295,13 +295,9 @@ def test_last_state_is_the_filters() -> None:
     for sensor, innovations in filtered.innovations.items():
         np.testing.assert_array_equal(smoothed.innovations[sensor].whitened, innovations.whitened)
         np.testing.assert_array_equal(smoothed.innovations[sensor].time, innovations.time)
-
-
-def test_without_measurements_it_is_the_filter() -> None:
-    case = dataclasses.replace(CASES["directions"], sensors=())
-    record, initial = simulated(case, np.random.default_rng(7))
-    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    assert_same(smoothed, estimation.run(record, case.noise, initial, full_covariance=True), 1e-8)
+    silent = dataclasses.replace(record, vectors=())
+    smoothed = estimation.smooth(silent, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, estimation.run(silent, case.noise, initial, full_covariance=True), 1e-8)
 
 
 def test_large_turns_are_split_into_sub_steps() -> None:
