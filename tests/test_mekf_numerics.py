@@ -293,7 +293,7 @@ def test_a_large_correction_is_exact(states, angle):
 # ----------------------------------------------------------------------------------------------- against the square root of the covariance
 
 
-def tracked(sigma, sharp=None, duration=4.0, states=()):
+def tracked(sigma, sharp=None, duration=2.0, states=()):
     """A record of a turning body with two stars, field and force, and perhaps one direction that is much sharper than all else."""
     record = record_of(duration=duration, rate=25.0, anisotropic=bool(states))
     series = [s for s in record.vectors if s.sensor in ("mag", "force")]
