@@ -39,11 +39,6 @@ def test_nees_is_the_quadratic_form(states):
     assert consistency.nees(e[0, 0], P[0, 0]).shape == ()
 
 
-def test_nees_refuses_a_covariance_that_is_none():
-    with pytest.raises(InputError, match=r"covariance\[1\] is not positive definite"):
-        consistency.nees(np.zeros((2, 2)), np.array([np.eye(2), np.diag([1.0, -1.0])]))
-
-
 @pytest.mark.parametrize(
     ("runs", "expected"), [(50, (0.8464, 1.1662)), (1000, (0.9645, 1.0361))], ids=["50 runs", "1000 runs"]
 )
@@ -73,24 +68,25 @@ def test_simultaneous_bounds_hold_for_independent_and_for_equal_epochs():
     assert wrong[1] < 0.005 * trials  # and conservative for equal ones
 
 
-@pytest.mark.parametrize("bad", [0.0, 1.0, 1.5])
-def test_a_probability_lies_between_0_and_1(bad):
-    with pytest.raises(InputError, match="confidence_level"):
-        consistency.mean_bounds(6, 10, bad)
-
-
 def random_covariances(generator, shape, n=6):
     root = generator.normal(size=(*shape, n, n)) + 2.0 * np.eye(n)
     return root @ np.swapaxes(root, -1, -2)
 
 
-# ------------------------------------------------------------------------------------------------------------------ manifold
-
-
-@pytest.mark.parametrize("states", [(), (0, 0), (6,), (-1,)])
-def test_nees_refuses_subsets_that_are_none(states):
-    with pytest.raises(InputError, match="states"):
-        consistency.nees(np.zeros(6), np.eye(6), states)
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        *((lambda p=p: consistency.mean_bounds(6, 10, p), "confidence_level") for p in (0.0, 1.0, 1.5)),
+        *((lambda s=s: consistency.nees(np.zeros(6), np.eye(6), s), "states") for s in ((), (0, 0), (6,), (-1,))),
+        (
+            lambda: consistency.nees(np.zeros((2, 2)), [np.eye(2), np.diag([1.0, -1.0])]),
+            r"covariance\[1\] is not positive",
+        ),
+    ],
+)
+def test_it_is_refused_by_the_name_of_the_argument(call, named):
+    with pytest.raises(InputError, match=named):
+        call()
 
 
 # -------------------------------------------------------------------------------------------------------------------- bounds

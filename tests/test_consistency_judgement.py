@@ -267,7 +267,7 @@ def scenario():
         gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
         sensors=stars(1e-3, 1e-3),
         rate=10.0,
-        duration=10.0,
+        duration=40.0,
         name="rest",
     )
 
@@ -283,7 +283,7 @@ def plan():
 @functools.cache
 def statistics_of(plan, **changes):
     filter_setup = replace(plan.setup, **changes)
-    return montecarlo.run(plan.scenario, (filter_setup,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
+    return montecarlo.run(plan.scenario, (filter_setup,), runs=200, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
 
 
 def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
@@ -305,7 +305,7 @@ def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
 
 def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
     """99 of 100 errors of one state within 1 σ at one epoch, all others the expected number: binomial, times the number of tests."""
-    few = montecarlo.run(plan.scenario, (plan.setup,), runs=100, seed=3, epochs=20, nis_bins=10)[0]
+    few = montecarlo.run(plan.scenario, (plan.setup,), runs=100, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
     usual = np.array([68, 95, 100])
     counts = np.tile(usual, (21, 6, 1))
     counts[20, 4, 0] = 82
@@ -318,7 +318,7 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
 
 
 def test_few_runs_cannot_tell(plan):
-    few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10)[0]
+    few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
     assert starved.judge().verdict == "cannot tell"
 

@@ -323,28 +323,6 @@ def test_both_faces_agree(option, kind):
         np.testing.assert_allclose(slow.whitened[name], innovations.whitened, rtol=1e-7, atol=1e-9)
 
 
-def test_single_steps_turn_the_states_that_are_carried_with_the_attitude():
-    """The filter of single steps by itself, from an attitude 20° off, whose corrections turn velocity and acceleration too."""
-    block = block_of("velocity")
-    record, _ = record_of(block_of("velocity", 0.02), duration=0.5)
-    state = estimation.with_error_states(start(), (block,))
-    P = state.covariance.copy()
-    P[:3, :3] += 0.1 * np.eye(3)
-    off = quaternion.multiply(state.attitude, quaternion.exp([0.2, -0.25, 0.1]))
-    state = dataclasses.replace(state, attitude=off, values=np.linspace(-0.3, 0.4, block.size), covariance=P)
-    whole = estimation.run(record, NOISE, state, (block,), full_covariance=True)
-    names = [series.sensor for series in record.vectors]
-    steps = StepFilter(NOISE, state, (block,), sensors=names)
-    samples = sorted((time, i, k) for i, series in enumerate(record.vectors) for k, time in enumerate(series.time))
-    for n, delta in enumerate(record.increments, 1):
-        steps.predict(delta, record.time[n] - record.time[n - 1])
-        while samples and samples[0][0] <= record.time[n] + 1e-9:
-            _, i, k = samples.pop(0)
-            steps.update(record.vectors[i], k)
-        np.testing.assert_allclose(steps.values, whole.error_states[block.name].values[n], atol=1e-10)
-        np.testing.assert_allclose(steps.P[:6, :6], whole.covariance[n], atol=1e-11)
-
-
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
 
 

@@ -244,7 +244,11 @@ TABLE = [
     (stepped, {"update": np.array([0.5, 0.0])}, "not of class VectorMeasurements"),
     (lambda: StepFilter(NOISE, start()).predict_update(X, lambda x: X), {}, "not of class VectorMeasurements"),
     (stepped, {"blocks": MAG_BIAS}, "give a tuple"),
-    (stepped, {"blocks": (MAG_BIAS,), "sensors": ("acc", "Mag")}, "'Mag'"),
+    (
+        stepped,
+        {"blocks": (MAG_BIAS,), "sensors": ("acc", "Mag"), "update": sample("direction", X, X, 0.1, "mag")},
+        "'Mag'",
+    ),
     (stepped, {"blocks": (MAG_BIAS,), "sensors": "mag"}, "sensors is 'mag'"),
     (stepped, {"sensors": "mag"}, "sensors is 'mag'"),
     (stepped, {"blocks": (MAG_BIAS,), "sensors": ("mag",), "update": sample("direction", X, X, 0.1, "up")}, "'up'"),

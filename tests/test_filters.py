@@ -525,6 +525,23 @@ def test_each_sensor_has_its_own_gains():
         np.testing.assert_array_equal(*(getattr(estimate, part) for estimate in estimates))
 
 
+def test_mahony_learns_a_constant_bias_with_its_default_gains():
+    """At rest under two vectors the bias error falls with time: a gain of the wrong sign would let it grow."""
+    n, bias = 6000, np.array([4e-3, -3e-3, 5e-3])
+    time = np.arange(n + 1) / 10.0
+    vectors = tuple(
+        series_of(name, "direction", time[1:], np.tile(r, (n, 1)), r, 0.01)
+        for name, r in (("up", [0.0, 0.0, 1.0]), ("north", [1.0, 0.0, 0.0]))
+    )
+    record = ImuRecord(time=time, increments=np.tile(bias / 10.0, (n, 1)), vectors=vectors)
+    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.01, bias_sigma=0.01)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+    off = np.linalg.norm(filters.run("mahony", record, noise, initial).bias - bias, axis=1) / np.linalg.norm(bias)
+    assert off[0] == 1.0
+    assert 0.0 < off[n // 10] < 0.5
+    assert off[-1] < 1e-3
+
+
 @pytest.mark.parametrize(("kind", "form"), SHARPEST)
 def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
     """``ω_mes = M δθ + n``: M by differences of the truth, Cov n by differences of the measurement."""
@@ -740,7 +757,7 @@ def assert_sound(estimate):
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["few", "thousands"])
 @pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_filter_stays_finite_from_any_start(name, many):
-    for seed in range(100, 3000) if many else range(24):
+    for seed in range(100, 3000) if many else range(16):
         record, initial = wild(seed, 2000 if many else 300)
         assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
@@ -802,14 +819,10 @@ def test_comparing_all_is_one_line_with_a_table():
         parts = [i.whitened[i.time >= estimate.time[late][0]].ravel() for i in estimate.innovations.values()]
         np.testing.assert_allclose(row["nis"], np.mean(np.concatenate(parts) ** 2), rtol=1e-12)
         assert row["degrees"] == len(np.concatenate(parts))
-    lines = str(compared).splitlines()
-    assert [line.split()[0] for line in lines[3 : 3 + len(filters.FILTERS)]] == list(filters.FILTERS)
-    assert f"{compared.summary()['mekf']['attitude_error'] / DEGREE:.4g}" in lines[3]
+    assert f"{compared.summary()['mekf']['attitude_error'] / DEGREE:.4g}" in str(compared)
     # Without truth it reports differences from the first filter.
     blind = filters.compare(dataclasses.replace(record, truth=None), BELIEF, initial, filters=["mahony", "mekf"])
     assert "from mahony" in str(blind)
-    assert str(blind).splitlines()[3].split()[1] == "-"
     assert 0.0 < blind.summary()["mekf"]["attitude_error"] < 0.1
     silent = filters.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")
     assert np.isnan(silent.summary()["mekf"]["nis"])
-    assert "consistent filter" not in str(silent)

@@ -178,7 +178,7 @@ def test_a_start_from_whole_vectors_is_that_from_their_directions():
 )
 def test_sigma_of_a_start_from_vertical_and_heading_has_the_tilt_s_part_and_the_gyro_s_error_between(times):
     """A dip of 1.17 rad: a tilt, of the measurement or by the gyro's error between the two, changes the heading by 2.4 times as much."""
-    dip, white, sigmas, runs, dt = 1.17, 0.01, (0.02, 0.002) if times[0] == times[1] else (0.003, 0.005), 120, 0.1
+    dip, white, sigmas, runs, dt = 1.17, 0.01, (0.02, 0.002) if times[0] == times[1] else (0.003, 0.005), 80, 0.1
     field = np.array([0.0, np.cos(dip), -np.sin(dip)])
     noise = ProcessNoise(angle_random_walk=white, rate_random_walk=0.0)
     random, nees, about_vertical = np.random.default_rng(21), [], []

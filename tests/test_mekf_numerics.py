@@ -45,7 +45,7 @@ def sharp_record(sigma, steps=400):
 
 
 OPTIONS = Gate(probability=1.0 - 1e-12)
-DECADES = [(exponent, gate) for exponent in range(-9, 4) for gate in (None, OPTIONS)]
+DECADES = [(exponent, gate) for exponent in range(-9, 4, 2) for gate in (None, OPTIONS)]
 """Of σ over the prior's."""
 NAMES = [f"1e{exponent}-{'plain' if gate is None else 'options'}" for exponent, gate in DECADES]
 REFUSED = r"^a measurement is more than 7e\+06 times as precise as the state"
@@ -197,7 +197,7 @@ def sparse_record(sensors, sigma, noise):
 
 
 @pytest.mark.parametrize("noise", [(1e-12, 0.0), (1e-12, 1e-14), (1e-4, 1e-5)], ids=["no drift", "little", "usual"])
-@pytest.mark.parametrize("sigma", [1e-7, 1e-6, 1e-5, 1e-3])
+@pytest.mark.parametrize("sigma", [1e-7, 1e-6, 1e-3])
 @pytest.mark.parametrize("sensors", [1, 3])
 @pytest.mark.parametrize("options", ["none", "gate", "huber", "covariance"])
 def test_variances_are_those_in_sixty_digits(options, sensors, sigma, noise):
@@ -293,7 +293,7 @@ def test_a_large_correction_is_exact(states, angle):
 # ----------------------------------------------------------------------------------------------- against the square root of the covariance
 
 
-def tracked(sigma, sharp=None, duration=4.0, states=()):
+def tracked(sigma, sharp=None, duration=2.0, states=()):
     """A record of a turning body with two stars, field and force, and perhaps one direction that is much sharper than all else."""
     record = record_of(duration=duration, rate=25.0, anisotropic=bool(states))
     series = [s for s in record.vectors if s.sensor in ("mag", "force")]

@@ -113,7 +113,7 @@ def test_the_share_of_differences_is_a_trace(decades):
 def test_moments_are_those_of_draws_from_the_mixture():
     random = np.random.default_rng(5)
     centre = quaternion.normalize(random.standard_normal(4))
-    q = quaternion.multiply(centre, quaternion.exp(0.05 * random.standard_normal((5, 3))))
+    q = quaternion.multiply(centre, quaternion.exp(0.4 * random.standard_normal((5, 3))))
     bias, weights = 1e-5 * random.standard_normal((5, 3)), random.random(5)
     root = np.diag([1e-2] * 3 + [1e-5] * 3) @ random.standard_normal((5, 6, 6))
     weights /= weights.sum()
@@ -182,7 +182,7 @@ def check_starts(outcomes, epochs):
 
 
 def test_from_starts_anywhere_it_finds_the_attitude_and_is_consistent():
-    check_starts(starts(16, multiple_model.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
+    check_starts(starts(10, multiple_model.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
 
 
 @pytest.mark.slow
@@ -239,7 +239,7 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
     random = np.random.default_rng(9)
     references = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.3], [0.2, -0.4, 1.0]])
     sigma = 0.2 * DEGREE
-    for _ in range(8):
+    for _ in range(4):
         q = quaternion.normalize(random.standard_normal(4))
         record = still(q, references, sigma, random, seconds=2, phases=phases)
         bank = multiple_model.run(record, QUIET, bias_sigma=1e-9)
@@ -288,8 +288,10 @@ def test_whole_vectors_count_by_their_direction():
         reference_f=field,
         sigma=series.sigma * length,
     )
-    a = multiple_model.run(record, belief, every=10)
-    b = multiple_model.run(dataclasses.replace(record, vectors=(whole,)), belief, every=10)
+    a, b = (
+        multiple_model.run(dataclasses.replace(record, vectors=(series,)), belief, every=10, hypotheses=24)
+        for series in (series, whole)
+    )
     assert quaternion.angle_between(a.estimate.attitude, b.estimate.attitude).max() < 1e-7
     assert b.estimate.innovations["magnetometer"].innovation.shape[1] == 3
     assert np.allclose(b.estimate.innovations["magnetometer"].innovation[-20:, 2], 0.0, atol=1e-4)
@@ -297,14 +299,14 @@ def test_whole_vectors_count_by_their_direction():
 
 def test_a_measured_attitude_needs_no_bank_and_counts_once():
     time, q, sigma = np.arange(11.0), quaternion.exp(np.array([0.3, 0.2, -0.5])), np.array([1e-4, 1e-4, 1e-3])
-    record = resting(tracker(time, q, sigma), time=time)
+    star = series_of("star", "direction", [0.0], [in_body(q, [0.0, 0.6, 0.8])], [0.0, 0.6, 0.8], 1e-3)
+    record = resting(tracker(time, q, sigma), star, time=time)
     bank = multiple_model.run(record, QUIET, bias_sigma=1e-4)
     assert bank.became_one == 0.0
     assert quaternion.angle_between(bank.estimate.attitude, q).max() < 1e-12
-    assert np.allclose(bank.estimate.sigma[0, :3], sigma)
     np.testing.assert_array_equal(bank.estimate.innovations["tracker"].time, time[1:])
     start = estimation.State(attitude=q, bias=np.zeros(3), covariance=np.diag([*sigma**2, *[1e-8] * 3]))
-    rest = dataclasses.replace(record, vectors=(record.vectors[0].taken(time > 0.0),))
+    rest = dataclasses.replace(record, vectors=(record.vectors[0].taken(time > 0.0), star))
     single = estimation.run(rest, QUIET, start, full_covariance=True)
     np.testing.assert_allclose(bank.estimate.covariance, single.covariance, rtol=1e-12, atol=1e-20)
 
@@ -347,18 +349,18 @@ def test_gaps_of_the_gyro_are_reported_whether_hypotheses_were_many_or_one(durat
     early, late = edges // 3, edges - edges // 6
     later = np.where(np.arange(edges) > early, 8.0, 0.0) + np.where(np.arange(edges) > late, 9.0, 0.0)
     gaps = dataclasses.replace(record, time=record.time + later)
-    bank = multiple_model.run(gaps, belief, every=5)
+    bank = multiple_model.run(gaps, belief, every=5, hypotheses=48)
     assert bank.converged == (duration > 60.0)
     assert bank.estimate.events == tuple(estimation.gaps(gaps))
     assert [(event.start, event.end) for event in bank.estimate.events] == [
         (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
     ]
-    assert multiple_model.run(record, belief, every=5).estimate.events == ()
+    assert multiple_model.run(record, belief, every=5, hypotheses=48).estimate.events == ()
 
 
 def test_the_bias_is_found_from_twenty_degrees_an_hour():
     record, belief = orbit(9, duration=9000.0)
-    bank = multiple_model.run(record, belief, every=100)
+    bank = multiple_model.run(record, belief, every=100, hypotheses=48)
     e, _ = judged(bank, record)
     assert np.abs(record.truth.bias[0]).max() > 5.0 * DEGREE_PER_HOUR
     assert np.abs(e[-1, 3:]).max() < 0.1 * DEGREE_PER_HOUR

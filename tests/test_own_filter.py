@@ -445,7 +445,7 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
         np.testing.assert_array_equal(verdicts.bound_of(replace(plan, dispersions=dispersions)), least)
     for error in ({"attitude_error": (1e-3, 0, 0)}, {"bias_error": (1e-6, 0, 0)}):
         assert verdicts.bound_of(replace(plan, dispersions=montecarlo.Dispersions(**error))) is None
-    runs = 150
+    runs = 100
     statistics = campaign.run(plan, tmp_path / "half.h5", runs=runs).statistics
     ratio = verdicts.efficiency(statistics, bound)
     low, high = consistency.mean_bounds(1, runs, 1.0 - 0.01 / 36)

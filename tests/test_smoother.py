@@ -240,9 +240,13 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
 # --------------------------------------------------------------------------------------------------------------------- consistency
 
 
-@pytest.mark.parametrize("name", ["one direction, turning", "vectors", "asynchronous", "coning"])
-def test_consistent_and_better_than_the_filter(name: str) -> None:
-    case, runs, rng = CASES[name], 25, np.random.default_rng(2024)
+@pytest.mark.parametrize(
+    ("name", "runs"),
+    [(name, 25) for name in ("one direction, turning", "vectors", "asynchronous", "coning")]
+    + [pytest.param(name, 2000, marks=pytest.mark.slow) for name in CASES],
+)
+def test_consistent_and_better_than_the_filter(name: str, runs: int) -> None:
+    case, rng = CASES[name], np.random.default_rng(2024)
     nees, squares = [], []
     for _ in range(runs):
         record, initial = simulated(case, rng)
@@ -257,19 +261,6 @@ def test_consistent_and_better_than_the_filter(name: str) -> None:
         check_consistent(of_part, 0.999, degrees)
     smoothed_square, filtered_square = np.mean(squares, axis=(0, 2, 3))
     assert smoothed_square < 0.8 * filtered_square
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_consistent_over_many_runs(name: str) -> None:
-    case, runs, rng = CASES[name], 2000, np.random.default_rng(99)
-    nees = []
-    for _ in range(runs):
-        record, initial = simulated(case, rng)
-        smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
-        epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
-        nees.append(consistency.nees(errors(smoothed, record.truth)[epochs], smoothed.covariance[epochs]))
-    check_consistent(np.array(nees), 0.99)
 
 
 @pytest.mark.parametrize(("wrong", "above"), [(0.5, True), (2.0, False)])
@@ -292,7 +283,7 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
 # ----------------------------------------------------------------------------------------------------------- never worse, the ends
 
 
-def test_last_state_is_the_filters() -> None:
+def test_last_state_is_the_filters_and_without_measurements_each_is() -> None:
     case = CASES["asynchronous"]
     record, initial = simulated(case, np.random.default_rng(7))
     smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
@@ -304,13 +295,9 @@ def test_last_state_is_the_filters() -> None:
     for sensor, innovations in filtered.innovations.items():
         np.testing.assert_array_equal(smoothed.innovations[sensor].whitened, innovations.whitened)
         np.testing.assert_array_equal(smoothed.innovations[sensor].time, innovations.time)
-
-
-def test_without_measurements_it_is_the_filter() -> None:
-    case = dataclasses.replace(CASES["directions"], sensors=())
-    record, initial = simulated(case, np.random.default_rng(7))
-    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    assert_same(smoothed, estimation.run(record, case.noise, initial, full_covariance=True), 1e-8)
+    silent = dataclasses.replace(record, vectors=())
+    smoothed = estimation.smooth(silent, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, estimation.run(silent, case.noise, initial, full_covariance=True), 1e-8)
 
 
 def test_large_turns_are_split_into_sub_steps() -> None:
@@ -506,14 +493,9 @@ def nees_of_recoveries(runs: int) -> np.ndarray:
     return np.array(nees)
 
 
-def test_lost_stretches_are_consistent() -> None:
-    mean = nees_of_recoveries(20).mean(axis=0) / 6.0
-    assert_inside(mean, 6, 20, 0.999)
-
-
-@pytest.mark.slow
-def test_lost_stretches_are_consistent_over_many_runs() -> None:
-    check_consistent(nees_of_recoveries(1000), 0.99)
+@pytest.mark.parametrize("runs", [20, pytest.param(1000, marks=pytest.mark.slow)])
+def test_lost_stretches_are_consistent(runs: int) -> None:
+    assert_inside(nees_of_recoveries(runs).mean(axis=0) / 6.0, 6, runs, 0.999)
 
 
 def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_refused() -> None:

@@ -170,3 +170,16 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     assert np.array_equal(f.P, P)
     with pytest.raises(IndexError):
         f.update(series, 1)
+
+
+def test_a_correction_turns_what_is_known_of_a_vector_in_fixed_axes():
+    """Of coloured noise that is independent of the attitude: its mean and covariance are those before, turned with the attitude."""
+    initial = estimation.with_error_states(start(), (SWAY,))
+    P, v = initial.covariance.copy(), np.array([0.03, -0.02, 0.01])
+    P[6:, 6:] = np.diag([1e-4, 2e-4, 3e-4])
+    f = StepFilter(NOISE, replace(initial, values=v, covariance=P), (SWAY,), sensors=("a", "b"))
+    assert f.update(sample("direction", quaternion.rotate(quaternion.exp([0.0, 0.3, 0.2]), X), X, 0.05, "a"))
+    R = quaternion.to_matrix(quaternion.multiply(f.attitude, quaternion.conjugate(IDENTITY)))
+    assert quaternion.angle_between(f.attitude, IDENTITY) > 0.2
+    np.testing.assert_allclose(f.values, R @ v, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(f.P[6:, 6:], R @ P[6:, 6:] @ R.T, rtol=0.0, atol=1e-18)

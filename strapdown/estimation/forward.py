@@ -464,14 +464,13 @@ class Judge:
             lock_outs=np.empty((number // 2 + len(self.problem.events.sensors), 4)),
         )
 
-    def events(self, out: gate.Outputs, recovered: int, locked: int) -> list[Event]:
-        """Return recoveries and lock-outs as events."""
-        return gate_events(out.recoveries[:recovered], out.lock_outs[:locked], self.problem.events.sensors)
-
-    def remembered(self, candidate: Candidate | None) -> GateMemory | None:
-        """Return the gate's state at the end; None without a gate."""
+    def remembered(self, body: structure.Body) -> GateMemory | None:
+        """Return the gate's state at the end, with the restart candidate in the filter's arrays; None without a gate."""
         if self.gate is None:
             return None
+        candidate = None
+        if self.memory[gate_rules.CANDIDATE]:
+            candidate = Candidate(attitude=body.x[1, :4], others=body.x[1, 4:], covariance=covariance_at(body, 1))
         counters = dict(zip(self.problem.events.sensors, self.counters, strict=True))
         return replace(self.start(), candidate=candidate, counts=self.memory, counters=counters)
 
@@ -649,8 +648,9 @@ def _run(problem: Problem, options: Options) -> Passed:
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
             outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0
-            number, *ends = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
-            happened |= {(event.kind, event.sensor, event.start): event for event in judge.events(judged, *ends)}
+            number, recovered, locked = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
+            reports = gate_events(judged.recoveries[:recovered], judged.lock_outs[:locked], events.sensors)
+            happened |= {(event.kind, event.sensor, event.start): event for event in reports}
         else:
             number = compiled(walk, kernels)(*arguments, every, form, out_of_part)
         if number < 0:
@@ -670,14 +670,14 @@ def _run(problem: Problem, options: Options) -> Passed:
     if options.whole_bias:
         estimate = replace(
             estimate,
-            bias=whole_bias(model, out.x),
+            bias=out.x[:, 4:7] + out.x[:, 7:] @ model.offsets,
             variance=out.whole_variance,
             covariance=out.whole_covariance if options.full_covariance else None,
         )
-    memory = judge.remembered(candidate_of(body, model) if judge.memory[gate_rules.CANDIDATE] else None)
+    memory = judge.remembered(body)
     return Passed(
         estimate=estimate,
-        make_end=lambda: state_of(body, model, memory, units),
+        make_end=lambda: state_of(body, memory, units),
         segments=stored[: number + 1],
     )
 
@@ -692,11 +692,6 @@ class TooPreciseError(InputError):
             "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, "
             "the filter has diverged before: the errors of the start are many times their sigmas"
         )
-
-
-def whole_bias(model: Model, x: Array) -> Array:
-    """Return the whole gyro bias (rows, 3) from q, bias and error states (rows, 7 + m)."""
-    return np.asarray(x[:, 4:7] + x[:, 7:] @ model.offsets)
 
 
 def covariance_at(body: structure.Body, i: int) -> Array:
@@ -716,12 +711,7 @@ def definite(P: Array) -> Array:
     return np.where(np.eye(len(P), dtype=bool), P, (1.0 - 4.0 * abs(least) - 1e-14) * P)
 
 
-def candidate_of(body: structure.Body, model: Model) -> Candidate:
-    """Return the restart candidate."""
-    return Candidate(attitude=body.x[1, :4], others=body.x[1, 4:], covariance=covariance_at(body, 1))
-
-
-def state_of(body: structure.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
+def state_of(body: structure.Body, memory: GateMemory | None, units: Mapping[str, float]) -> State:
     """Return the state of the filter."""
     return State(
         attitude=body.x[0, :4],

@@ -505,9 +505,7 @@ class LiveFilter:
         """
         if not self._whole:
             return forward.state_of_numbers(self._body.state.copy())
-        model, memory = self._problem.model, self._judge.memory
-        candidate = forward.candidate_of(self._body, model) if memory[gate_rules.CANDIDATE] else None
-        return copy.deepcopy(forward.state_of(self._body, model, self._judge.remembered(candidate), {}))
+        return copy.deepcopy(forward.state_of(self._body, self._judge.remembered(self._body), {}))
 
     def __reduce__(self) -> Any:
         """Raise an error: a copy would share the arrays of the compiled kernel."""

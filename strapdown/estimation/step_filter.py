@@ -77,8 +77,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if isinstance(sensors, str):
             raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
         affected = [sensor for block in self.error_states for sensor in block.effects]
-        for sensor in affected if sensors else ():
-            one_of("sensor of error_states", sensor, sensors)
         self.sensors = tuple(sensors or affected) if self.error_states else ()
         n = 6 + len(state.values)
         super().__init__(dim_x=n, dim_z=2)

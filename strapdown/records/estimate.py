@@ -79,7 +79,7 @@ class Innovations(ByValue):
 SINGLE_ROUNDING = 1e-6
 """Asymmetry of a covariance, in units of σᵢσⱼ, that a filter in single precision may have."""
 
-EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "gap")
+EVENT_KINDS = ("recovery", "lock-out", "gap")
 """Kinds of :class:`Event`."""
 
 
@@ -89,19 +89,17 @@ class Event:
 
     Parameters
     ----------
-    kind : {"recovery", "hypotheses", "lock-out", "gap"}
-        Kind of event, in this order: a filter that rejected good measurements was restarted; a bank of hypotheses replaced the filter
-        while a rotation was ambiguous; a gate rejected a sensor more often than it accepted it; gyro samples were missing for much longer
-        than the sample interval.
+    kind : {"recovery", "lock-out", "gap"}
+        Kind of event, in this order: a filter that rejected good measurements was restarted; a gate rejected a sensor more often than it
+        accepted it; gyro samples were missing for much longer than the sample interval.
     start : float
         Time of its beginning, s.
     end : float
-        Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the next gyro sample.
+        Time of its end, s: the recovery, the last rejection, the next gyro sample.
     sensor : str, default ""
         Sensor concerned, if any.
     value : float, default 0.0
-        Recovery: number of consecutive rejections. Hypotheses: number remaining (0: decided). Lock-out: number of rejections. Gap: its
-        duration over the median sample interval.
+        Recovery: number of consecutive rejections. Lock-out: number of rejections. Gap: its duration over the median sample interval.
     """
 
     kind: str
@@ -116,14 +114,6 @@ class Event:
             return (
                 f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were rejected and agreed with "
                 f"each other from {self.start:.6g} s on; the estimate in between is wrong."
-            )
-        if self.kind == "hypotheses":
-            end = (
-                f"{self.value:.0f} of them were left at the end of the record" if self.value else "then one was chosen"
-            )
-            return (
-                f"From {self.start:.6g} s to {self.end:.6g} s hypotheses replaced the filter, because {self.sensor} left a rotation "
-                f"ambiguous: {end}."
             )
         if self.kind == "lock-out":
             return (
