@@ -161,7 +161,9 @@ def test_the_covariance_is_consistent_in_many_runs(case, smoothed):
     assert wrong(judged(case, CASES[case], 600, 40.0, smoothed=smoothed, seed=12)) == {}
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if len(CASES[case]) == 1 else []) for case in CASES]
+)
 def test_it_is_not_with_the_blocks_left_out(case):
     verdict = judged(case, (), 10, 12.0)["all"]
     assert verdict.outside == 5

@@ -265,7 +265,7 @@ def record_of(
     sigma: float = 0.05,
     phase: float = 0.0,
 ) -> tuple[ImuRecord, dict]:
-    """A body that turns and is moved about as the block says, an accelerometer half as often as the gyro, and a heading."""
+    """A body that turns and is moved about as the block says, an accelerometer half as often as the gyro, and a field."""
     rng = np.random.default_rng(seed)
     edges = np.arange(round(duration * rate) + 1) / rate
     dt = np.diff(edges)[:, None]
@@ -280,13 +280,13 @@ def record_of(
     felt = path["acceleration"][np.searchsorted(every, np.round(time, 9))] + UP
     force = in_body(HAND.attitude(time), felt) + sigma * rng.standard_normal((len(time), 3))
     north = np.array([0.0, 1.0, 0.0])
-    compass = in_body(HAND.attitude(edges[5::10]), north)
-    compass = compass + 0.05 * rng.standard_normal(compass.shape)
+    field = in_body(HAND.attitude(edges[5::10]), north)
+    field = field + 0.05 * rng.standard_normal(field.shape)
     if kind == "vector":
         acc = series_of("acc", kind, time, force, UP, sigma)
     else:
         acc = series_of("acc", kind, time, unit(force), UP, sigma / 9.81)
-    series = acc, series_of("compass", "heading", edges[5::10], unit(compass), north, 0.05)
+    series = acc, series_of("mag", "vector", edges[5::10], field, north, 0.05)
     truth = {"attitude": HAND.attitude(edges), "bias": bias}
     truth["states"] = path["states"][np.searchsorted(every, np.round(edges, 9))]
     return ImuRecord(time=edges, increments=increments, vectors=series), truth
@@ -369,18 +369,15 @@ def least_squares(record: ImuRecord, block: error_states.BoundedVelocity) -> tup
         turned[:3] = record.increments[k]
         information[own, own] += step.T @ weight @ step
         right[own] += step.T @ weight @ turned
-    up, (acc, _) = 9.81, record.vectors
-    H = np.zeros((3, n))
-    H[:, :3] = up * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    H[:, 6:] = np.asarray(block.effects["acc"].offset_f).T
-    compass = np.zeros((1, n))
-    compass[0, 2] = 1.0
-    for series, rows in ((acc, H), (record.vectors[1], compass)):
+    for series in record.vectors:
+        rows = np.zeros((3, n))
+        rows[:, :3] = kinematics.skew(series.reference_f)
+        if series.sensor == "acc":
+            rows[:, 6:] = np.asarray(block.effects["acc"].offset_f).T
         for k, z, sigma in zip(np.searchsorted(record.time, series.time), series.vector_b, series.sigma, strict=True):
             own = slice(k * n, (k + 1) * n)
-            y = z - UP if len(rows) == 3 else np.array([z[0]])
             information[own, own] += rows.T @ rows / sigma**2
-            right[own] += rows.T @ y / sigma**2
+            right[own] += rows.T @ (z - series.reference_f) / sigma**2
     size = 1.0 / np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information * np.outer(size, size)) * np.outer(size, size)
     return (covariance @ right).reshape(edges, n), np.diag(covariance).reshape(edges, n)
@@ -395,11 +392,10 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     time = np.arange(41) / 50.0
     increments = small * 1e-3 * rng.standard_normal((40, 3))
     felt = UP + small * rng.standard_normal((13, 3))
-    east = small * 0.05 * rng.standard_normal(8)
-    north = np.stack([np.sin(east), np.cos(east), np.zeros(8)], axis=-1)
+    north = np.array([0.0, 1.0, 0.0])
     series = (
         series_of("acc", "vector", time[2::3], felt, UP, 0.05),
-        series_of("compass", "heading", time[4::5], north, [0.0, 1.0, 0.0], 0.05),
+        series_of("mag", "vector", time[4::5], north + small * rng.standard_normal((8, 3)), north, 0.05),
     )
     record = ImuRecord(time=time, increments=increments, vectors=series)
     initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
