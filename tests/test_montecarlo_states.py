@@ -91,11 +91,7 @@ MODELS = {
             gyro_drift_sigma=(2e-5,),
             gyro_drift_time=(20.0,),
             gyro_fast_bias_sigma=3e-5,
-            sensors={
-                "magnetometer": SensorStates(
-                    bias_sigma=0.02, mounting_sigma=0.01, correlated_sigma=2e-3, correlation_time=5.0
-                )
-            },
+            sensors={"magnetometer": SensorStates(bias_sigma=0.02, mounting_sigma=0.01)},
         ),
     ),
     "no error states, plain sensors": ((accelerometer(), magnetometer("heading"), TRACKER), States()),
