@@ -28,7 +28,6 @@ from measured import (
 from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
-from strapdown.checks import InputError
 from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.observability import state_names, without_errors
@@ -38,7 +37,7 @@ from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine, six_states, smoother, structure
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements, triad
+from strapdown.vectors import triad
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 
@@ -732,46 +731,3 @@ def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, b
     np.testing.assert_allclose(P[:3, :3], expected, rtol=bound, atol=bound * sigma**2)
     prior_of_the_rest = estimation.with_error_states(start_at, blocks).covariance[3:, 3:]
     np.testing.assert_allclose(P[3:, 3:], prior_of_the_rest, rtol=1e-14, atol=1e-14)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1.0, 1e3])
-def test_the_covariance_stays_positive_definite(sharpness):
-    """Ten thousand predictions and updates whose σ is so many times the prior's; one of 1e-9 is refused."""
-    rng = np.random.default_rng(3)
-    edges = np.arange(10001) / 100.0
-    sensors = []
-    for name, r in (("mag", FIELD / np.linalg.norm(FIELD)), ("force", UP / 9.81)):
-        z = in_body(SWAY.attitude(edges[1:]), r)
-        sensors.append(series_of(name, "vector", edges[1:], z, r, 0.03 * sharpness))
-    increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
-    record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
-    options = {"every": 100, "full_covariance": True}
-    if sharpness < 1e-8:
-        with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
-            estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options)
-        return
-    P = estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options).whole_covariance
-    assert np.array_equal(P, np.swapaxes(P, 1, 2))
-    # Of a correlation matrix eigenvalues below 1e-16 are rounding.
-    assert np.linalg.eigvalsh(correlation(P, np.sqrt(np.einsum("kii->ki", P)))).min() > -1e-14
-
-
-@pytest.mark.parametrize("option", ["none", pytest.param("gyro scale", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
-def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
-    """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
-    turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
-    series = VectorMeasurements(
-        sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
-    )
-    record = resting(series)
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
-    estimate = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
-    correction = wide**2 / (wide**2 + sigma**2) * turn
-    assert quaternion.angle_between(estimate.attitude[0], quaternion.exp(correction)) < 1e-7
-    length_error = abs(np.linalg.norm(estimate.attitude[0]) - 1.0)
-    assert length_error < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
-    J = kinematics.right_jacobian(correction)
-    P = J @ J.T / (wide**-2.0 + sigma**-2.0)
-    np.testing.assert_allclose(estimate.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

@@ -304,34 +304,6 @@ def test_an_accelerometer_at_an_arm_feels_the_turning_body(kind):
         np.testing.assert_allclose(rows[:, 6 + k], (ahead - back) / 2e-5, rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["vector", "direction"])
-def test_a_lever_arm_is_found(kind):
-    arm = np.array([0.2, -0.1, 0.3])
-    scenario = Scenario(
-        motion=SWAY,
-        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        sensors=(
-            vectors.Magnetometer(name="mag", field_f=np.array([2e-5, 0.0, -4e-5]), sigma=2e-7, rate=20.0),
-            vectors.Accelerometer(name="acc", sigma=0.02, rate=50.0, kind=kind, lever_arm_b=arm),
-        ),
-        rate=200.0,
-        duration=20.0,
-    )
-    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-    ratios = []
-    for seed in range(6):
-        record = scenarios.simulate(scenario, seed)
-        estimate = setup.run(record, filter_setup, begun(record, 0.01, 1e-4, seed))
-        block = estimate.error_states["acc lever arm"]
-        assert block.units == ("m", "m", "m")
-        assert np.all(block.sigma[-1] < 0.01)
-        ratios.append(np.mean(((block.values[-1] - arm) / block.sigma[-1]) ** 2))
-        nis = estimate.innovations["acc"].nis.mean() / estimate.innovations["acc"].innovation.shape[1]
-        assert 0.9 < nis < 1.1
-    assert 0.3 < np.mean(ratios) < 2.2
-
-
 def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
     """Its share of a direction changes with the field's strength: with that model the filter is consistent, and without it not."""
     scenario = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=4000.0)

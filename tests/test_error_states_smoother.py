@@ -9,7 +9,6 @@ import scipy.linalg
 from measured import SWAY as BODY
 from measured import (
     UP,
-    assert_inside,
     beside_silent,
     every_kind,
     in_body,
@@ -20,7 +19,7 @@ from measured import (
     unit,
 )
 
-from strapdown import consistency, estimation, kinematics, quaternion, records
+from strapdown import estimation, kinematics, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
@@ -329,31 +328,6 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
         estimates.append(run(resting(acc, mag), still, initial, blocks, full_covariance=True))
     assert difference(*estimates, 0, 0) < 1e-6
     assert np.linalg.norm(quaternion.log(estimates[0].attitude[0])) > 0.9
-
-
-def pushed(kind: str, runs: int) -> np.ndarray:
-    """NEES over its degrees of what is carried, of a body whose heading is found at the end: there, and smoothed amid (runs, 2)."""
-    nees = np.empty((runs, 2))
-    for run in range(runs):
-        rng = np.random.default_rng([run, 8])
-        small = small_record((CARRIED[kind],), 0.03, seed=100 + run, late=True, off=rng.standard_normal(3))
-        estimate = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
-        values = next(iter(estimate.error_states.values())).values
-        # Relative to the estimated attitude, of which alone it is known.
-        turn = quaternion.to_matrix(quaternion.multiply(estimate.attitude, quaternion.conjugate(small.attitude)))
-        true = np.einsum("kij,kjp->kip", turn, small.values.reshape(len(turn), 3, -1)).reshape(values.shape)
-        edges = [-1, len(turn) // 2]
-        P = estimate.whole_covariance[edges, 6:, 6:]
-        nees[run] = consistency.nees((true - values)[edges], P) / values.shape[1]
-    return nees
-
-
-@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", slow(CARRIED, "coloured, fixed axes", "position"))
-def test_what_is_carried_is_consistent(kind, runs):
-    """Of a heading found at the end; without the turn carried along, the filter's push of several tenths of g was off by 3 of its σ."""
-    nees = pushed(kind, runs)
-    assert_inside(nees.mean(axis=0), CARRIED[kind].size, runs, 0.999)
 
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
