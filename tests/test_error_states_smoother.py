@@ -259,7 +259,7 @@ KINDS = {
         force_disturbance={"noise_sigma": 0.15 * f},
     ),
     "gyro force": lambda f: (error_states.GyroForce(along_sigma=2e-3 * f, across_sigma=1e-3 * f * (1.0 - np.eye(3))),),
-    "scale": lambda f: (error_states.VectorScale(sensor="acc", scale_sigma=0.03 * f),),
+    "mounting": lambda f: (error_states.SensorMounting(sensor="acc", mounting_sigma=0.03 * f),),
     "lever arm": lambda f: (error_states.LeverArm(sensor="acc", arm_sigma=0.2 * f, strength=1.0),),
 }
 CARRIED = {
@@ -287,7 +287,7 @@ def slow(kinds, *which):
     return [pytest.param(kind, marks=pytest.mark.slow if kind in which else []) for kind in kinds]
 
 
-@pytest.mark.parametrize("kind", slow(KINDS, "gyro force", "scale", "lever arm"))
+@pytest.mark.parametrize("kind", slow(KINDS, "gyro force", "mounting", "lever arm"))
 def test_the_smoother_is_least_squares_to_first_order(kind):
     """Of the whole trajectory, prior and gyro noise and measurements together, by Gauss–Newton.
 

@@ -204,7 +204,7 @@ TABLE = [
     (run, {"blocks": (VectorBias(sensor="mga", bias_sigma=1.0),)}, "'mag'"),
     (run, {"blocks": (MAG_BIAS,) * 2}, "are named 'mag bias'"),
     (run, {"blocks": ("mag",)}, "declares no error states"),
-    (run, {"blocks": (error_states.VectorScale(sensor="tracker", scale_sigma=0.1),)}, "whole attitudes"),
+    (run, {"blocks": (error_states.SensorMounting(sensor="tracker", mounting_sigma=0.1),)}, "whole attitudes"),
     (
         run,
         {"initial": estimation.with_error_states(start(), (MAG_BIAS,)), "blocks": EVERY_KIND},

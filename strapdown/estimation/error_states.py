@@ -31,7 +31,6 @@ __all__ = [
     "LeverArm",
     "SensorMounting",
     "VectorBias",
-    "VectorScale",
 ]
 
 AXES = ("x", "y", "z")
@@ -361,11 +360,9 @@ class GyroTemperature(ErrorStates):
 
 
 class _FirstOrder(ErrorStates):
-    """First-order Gauss–Markov states with one correlation time."""
+    """Stationary first-order Gauss–Markov states with one correlation time."""
 
     correlation_time: float
-    stationary_sigma: Array
-    """Stationary standard deviation σ of each state (3,)."""
 
     @property
     def decay(self) -> Array:
@@ -375,7 +372,7 @@ class _FirstOrder(ErrorStates):
     @property
     def density(self) -> Array:
         """2σ²/τ."""
-        return 2.0 * self.stationary_sigma**2 / self.correlation_time
+        return 2.0 * self.sigma**2 / self.correlation_time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -388,27 +385,20 @@ class GyroGaussMarkov(_FirstOrder):
         Stationary standard deviation of the drift, rad/s, by body axis.
     correlation_time : float
         Correlation time of the drift, s.
-    initial_sigma : float or ndarray (3,), optional
-        Standard deviation of the drift at the start, rad/s, by body axis: larger than the stationary one for a drift that settles after
-        switching on. Default: the stationary one.
     name : str, default "gyro drift"
         Name of these error states.
     """
 
     bias_sigma: float | Array
     correlation_time: float
-    initial_sigma: float | Array | None = None
     name: str = "gyro drift"
     components = AXES
     units = ("rad/s",) * 3
 
     def __post_init__(self) -> None:
         """Check all."""
-        stationary = sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
-        if self.initial_sigma is not None:
-            sigma = _spread(f"{self.name}: initial_sigma", self.initial_sigma, "rad/s")
-            self._set(initial_sigma=sigma)
-        self._set(bias_sigma=stationary, stationary_sigma=stationary, sigma=sigma)
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
+        self._set(bias_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
 
     @property
@@ -508,37 +498,6 @@ class LeverArm(ErrorStates):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VectorScale(ErrorStates):
-    """Scale factors and misalignments (soft iron) of a vector sensor: all nine entries of S in ``m_b = (I + S) R_fbᵀ r``, constant.
-
-    Parameters
-    ----------
-    sensor : str
-        Name of the sensor.
-    scale_sigma : float
-        Standard deviation of each entry of S, dimensionless.
-    name : str, default "<sensor> scale"
-        Name of these error states.
-    """
-
-    sensor: str
-    scale_sigma: float
-    name: str = ""
-    components = ENTRIES
-    units = ("1",) * 9
-
-    def __post_init__(self) -> None:
-        """Check the deviation."""
-        self._set(name=self.name or f"{self.sensor} scale")
-        self._set(sigma=np.full(9, positive(f"{self.name}: scale_sigma", self.scale_sigma)))
-
-    @property
-    def effects(self) -> Mapping[str, Effect]:
-        """One entry of S per state."""
-        return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class SensorMounting(ErrorStates):
     """Mounting of a vector sensor: the small constant rotation θ from the body's axes to the sensor's, ``m = (I − [θ]×) R_fbᵀ r``.
 
@@ -616,7 +575,7 @@ class GaussMarkov(_FirstOrder):
         """Check all."""
         self._set(name=self.name or f"{self.sensor} disturbance", units=(self.unit,) * 3)
         sigma = _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit)
-        self._set(noise_sigma=sigma, stationary_sigma=sigma, sigma=sigma)
+        self._set(noise_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
         one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
         if self.frame == "fixed" and len(set(self.sigma)) > 1:
