@@ -372,7 +372,7 @@ WALKING = error_states.VectorBias(sensor="mag", bias_sigma=1e-6, rate_random_wal
 
 
 HELD = error_states.BoundedVelocity(
-    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, strength=1.0
+    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_time=1.0 / 18.0, strength=1.0
 )
 FACES = {**CASES, "hard iron that walks": (("mag", "acc"), (WALKING,)), "chains": (("mag", "acc"), (WALKING, HELD))}
 

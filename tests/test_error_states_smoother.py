@@ -314,7 +314,7 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     """A body at rest, and no noise: what is measured at the end says of the start what it would have said there."""
     blocks = (
         error_states.BoundedVelocity(
-            sensor="acc", velocity_time=1e9, acceleration_time=1e9, acceleration_sigma=1.0, strength=1.0
+            sensor="acc", velocity_time=1e9, acceleration_time=1e9, velocity_sigma=1e9, strength=1.0
         ),
     )
     still = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=1e-12)

@@ -225,9 +225,6 @@ def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
 
 def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
     """Return the standard deviations of the entries of a matrix (3, 3); entries of zero are no states, and all zero is refused."""
-    for what, value in zip(units, (diagonal, off_diagonal), strict=True):
-        if np.ndim(value) == 0:
-            positive(f"{name}: {what}", value)  # type: ignore[arg-type]
     whole = np.zeros((3, 3))
     on = np.eye(3, dtype=bool)
     axes = array(f"{name}: {units[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
@@ -598,8 +595,8 @@ class BoundedVelocity(ErrorStates):
     first-order coloured noise at high frequency and vanishes at zero, as for every body that stays near one place; a constant part of the
     noise would appear as tilt. With ``position_time`` the position is bounded too: ``ṗ = −p/τ_p + s``, ``ṡ = −s/τ_v + u``, ``v = ṗ``.
 
-    The noise is isotropic. Give two of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time``: with the rates
-    ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, λ = 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
+    The noise is isotropic. The σ of the acceleration is ``σ_v √(λ_p λ_v + (λ_p + λ_v) λ_a)`` with λ = 1/τ (λ_p = 0 without a bounded
+    position).
 
     Parameters
     ----------
@@ -607,11 +604,9 @@ class BoundedVelocity(ErrorStates):
         Name of the accelerometer.
     velocity_time : float
         Time constant τ_v of the velocity, s.
-    velocity_sigma : float, default 0.0
+    velocity_sigma : float
         Stationary σ of each component of v, m/s, fixed axes.
-    acceleration_sigma : float, default 0.0
-        Stationary σ of each component of a, m/s², fixed axes.
-    acceleration_time : float, default 0.0
+    acceleration_time : float
         Time constant τ_a of the acceleration, s.
     position_time : float, default 0.0
         Time constant τ_p of the position, s; 0: the position is not bounded and is no state.
@@ -623,45 +618,23 @@ class BoundedVelocity(ErrorStates):
 
     sensor: str
     velocity_time: float
-    velocity_sigma: float = 0.0
-    acceleration_sigma: float = 0.0
-    acceleration_time: float = 0.0
+    velocity_sigma: float
+    acceleration_time: float
     position_time: float = 0.0
     strength: float = STANDARD_GRAVITY
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check all, and compute the third of the three values of which two are given."""
+        """Check all."""
         self._set(name=self.name or f"{self.sensor} velocity")
-        positive(f"{self.name}: velocity_time", self.velocity_time, unit="s")
-        positive(f"{self.name}: strength", self.strength, unit="m/s²")
+        for field_name, unit in (
+            ("velocity_time", "s"),
+            ("velocity_sigma", "m/s"),
+            ("acceleration_time", "s"),
+            ("strength", "m/s²"),
+        ):
+            positive(f"{self.name}: {field_name}", getattr(self, field_name), unit=unit)
         non_negative(f"{self.name}: position_time", self.position_time, unit="s")
-        three = {"velocity_sigma": "m/s", "acceleration_sigma": "m/s²", "acceleration_time": "s"}
-        values = [
-            non_negative(f"{self.name}: {field_name}", getattr(self, field_name), unit=unit)
-            for field_name, unit in three.items()
-        ]
-        velocity, acceleration, time = values
-        values_given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
-        if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: {values_given}: two must be above zero; the third follows from them")
-        slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
-        if time == 0.0:
-            rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
-            if rate <= 0.0:
-                raise InputError(
-                    f"{self.name}: acceleration_sigma is {acceleration:g} m/s² with a velocity_sigma of {velocity:g} m/s, less than "
-                    f"velocity_time and position_time imply ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
-                )
-            self._set(acceleration_time=1.0 / rate)
-            return
-        ratio = float(np.sqrt(p * slow + (p + slow) / time))
-        if acceleration == 0.0:
-            self._set(acceleration_sigma=ratio * velocity)
-        elif velocity == 0.0:
-            self._set(velocity_sigma=acceleration / ratio)
-        elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {values_given} contradict each other at these times; give two of them")
 
     @property
     def _rates(self) -> Array:

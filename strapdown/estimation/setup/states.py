@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from strapdown import units
-from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.checks import InputError, array, known_keys, non_negative, one_of, positive
 from strapdown.estimation.error_states import (
     BoundedVelocity,
     ErrorStates,
@@ -49,7 +49,6 @@ def _any(value: Entries) -> bool:
 VELOCITY = {
     "velocity_time": "s",
     "velocity_sigma": "m/s",
-    "acceleration_sigma": "m/s²",
     "acceleration_time": "s",
     "position_time": "s",
 }
@@ -82,11 +81,9 @@ class SensorStates:
         σ of the position of an accelerometer relative to the point that does not accelerate, on each body axis, m.
     velocity_time : float, default 0.0
         Correlation time of the velocity of a hand-held unit, s, for the acceleration that its accelerometer measures
-        (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give also two of the next three.
+        (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give also the next two.
     velocity_sigma : float, default 0.0
         Stationary σ of each component of the velocity, m/s, fixed axes.
-    acceleration_sigma : float, default 0.0
-        Stationary σ of each component of the acceleration, m/s², fixed axes.
     acceleration_time : float, default 0.0
         Correlation time of the acceleration, s.
     position_time : float, default 0.0
@@ -102,7 +99,6 @@ class SensorStates:
     lever_arm_sigma: Entries = 0.0
     velocity_time: float = 0.0
     velocity_sigma: float = 0.0
-    acceleration_sigma: float = 0.0
     acceleration_time: float = 0.0
     position_time: float = 0.0
 
@@ -234,13 +230,13 @@ class States(ByValue):
         """Return the error states of the gyro whose σ is above zero."""
         blocks: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
-            scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
+            scale, misalignment = np.asarray(self.gyro_scale_sigma), np.asarray(self.gyro_misalignment_sigma)
             blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
         if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
-            along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
+            along, across = np.asarray(self.gyro_force_sigma), np.asarray(self.gyro_cross_force_sigma)
             blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
         if _any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
-            slope = _spread(self.gyro_temperature_sigma, 0.0)[0]
+            slope = np.asarray(self.gyro_temperature_sigma)
             blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
             blocks.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
@@ -328,15 +324,6 @@ def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names:
     return replace(states, **{field: getattr(none, field) for field in dropped})
 
 
-def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
-    """Return σ of a matrix's diagonal entries (3,) and of its other entries (3, 3), with zeros on the diagonal."""
-    on = np.broadcast_to(np.asarray(diagonal, np.float64), (3,)).copy()
-    off = np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)).copy()
-    if np.ndim(off_diagonal) == 0:
-        np.fill_diagonal(off, 0.0)
-    return on, off
-
-
 # ------------------------------------------------------------------------------------------------------------------------- files
 
 _FORCE: tables.Choice = (
@@ -369,7 +356,6 @@ SENSOR_FORM: tables.Form = {
     "lever_arm_sigma": tables.METRES,
     "velocity_time": tables.SECONDS,
     "velocity_sigma": _SPEED,
-    "acceleration_sigma": tables.METRES_PER_SECOND_SQUARED,
     "acceleration_time": tables.SECONDS,
     "position_time": tables.SECONDS,
 }
