@@ -223,28 +223,22 @@ def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     )
 
 
-def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
-    """Return the standard deviations of the entries of a matrix (3, 3); entries of zero are no states, and all zero is refused."""
-    whole = np.zeros((3, 3))
-    on = np.eye(3, dtype=bool)
-    axes = array(f"{name}: {units[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
-    across = array(f"{name}: {units[1]}", np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)), (3, 3))
-    whole[on] = axes
-    whole[~on] = across[~on]
+def _matrix(
+    name: str, diagonal: float | Array, off_diagonal: float | Array, fields: tuple[str, str]
+) -> tuple[tuple[str, ...], Array]:
+    """Return names and σ of those entries of a matrix (3, 3) that are states: not zero, of which there must be one."""
+    axes = array(f"{name}: {fields[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
+    across = array(f"{name}: {fields[1]}", np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)), (3, 3))
     if np.ndim(off_diagonal) == 2 and np.any(np.diag(across) != 0.0):
-        raise InputError(f"{name}: {units[1]} has entries on its diagonal; give those as {units[0]}")
+        raise InputError(f"{name}: {fields[1]} has entries on its diagonal; give those as {fields[0]}")
+    whole = np.where(np.eye(3, dtype=bool), axes, across).ravel()
     if np.any(whole < 0.0):
-        i, j = np.argwhere(whole < 0.0)[0]
-        raise InputError(f"{name}: the sigma of {ENTRIES[3 * i + j]} is {whole[i, j]:g}; it must not be negative")
-    if not whole.any():
-        raise InputError(f"{name}: {units[0]} and {units[1]} are both 0; give one of them, or drop these states")
-    return whole
-
-
-def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
-    """Return names and σ of those entries of a matrix that are states."""
-    nonzero = np.flatnonzero(sigmas.ravel())
-    return tuple(ENTRIES[k] for k in nonzero), np.asarray(sigmas.ravel()[nonzero])
+        k = int(np.argmax(whole < 0.0))
+        raise InputError(f"{name}: the sigma of {ENTRIES[k]} is {whole[k]:g}; it must not be negative")
+    nonzero = np.flatnonzero(whole)
+    if not len(nonzero):
+        raise InputError(f"{name}: {fields[0]} and {fields[1]} are both 0; give one of them, or drop these states")
+    return tuple(ENTRIES[k] for k in nonzero), whole[nonzero]
 
 
 def _units_of_entries(names: tuple[str, ...]) -> Array:
@@ -274,8 +268,8 @@ class GyroScale(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
-        sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
-        components, sigma = _entries(sigmas)
+        fields = ("scale_sigma", "misalignment_sigma")
+        components, sigma = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, fields)
         self._set(
             components=components,
             units=tuple("1" if component in AXES else "rad" for component in components),
@@ -313,8 +307,8 @@ class GyroForce(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check all; the states are the entries of G, row by row; xy is the bias about x per force along y."""
-        sigmas = _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
-        components, sigma = _entries(sigmas)
+        fields = ("along_sigma", "across_sigma")
+        components, sigma = _matrix(self.name, self.along_sigma, self.across_sigma, fields)
         gravity = array(f"{self.name}: gravity_f", self.gravity_f, (3,))
         self._set(components=components, units=("rad s/m",) * len(components), sigma=sigma, gravity_f=gravity)
         if not np.any(self.gravity_f):
