@@ -42,10 +42,6 @@ def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entrie
     return tuple(tuple(row) if isinstance(row, list) else row for row in rows)
 
 
-def _any(value: Entries) -> bool:
-    return bool(np.any(np.asarray(value) > 0.0))
-
-
 VELOCITY = {
     "velocity_time": "s",
     "velocity_sigma": "m/s",
@@ -106,7 +102,7 @@ class SensorStates:
         """Check every field."""
         for name, unit in (("mounting_sigma", "rad"), ("bias_sigma", ""), ("lever_arm_sigma", "m")):
             value = _entries(name, getattr(self, name), (3,), unit)
-            if name != "lever_arm_sigma" and _any(value) and not np.all(value):
+            if name != "lever_arm_sigma" and np.any(value) and not np.all(value):
                 raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
             object.__setattr__(self, name, value)
         non_negative("correlated_sigma", self.correlated_sigma)
@@ -133,14 +129,14 @@ class SensorStates:
         one_of(f"{sensor}: kind", kind, KINDS)
         strength = 1.0 if kind == "vector" else gravity
         blocks: list[ErrorStates] = []
-        if _any(self.mounting_sigma):
+        if np.any(self.mounting_sigma):
             blocks.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
-        if _any(self.bias_sigma):
+        if np.any(self.bias_sigma):
             # Only beside a velocity is the vector known to be a specific force.
             unit = "m/s²" if kind == "vector" and self.velocity_time > 0.0 else "1"
             bias_sigma = np.asarray(self.bias_sigma)
             blocks.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
-        if _any(self.lever_arm_sigma):
+        if np.any(self.lever_arm_sigma):
             blocks.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
         if self.correlated_sigma > 0.0:
             blocks.append(
@@ -229,13 +225,13 @@ class States(ByValue):
     def _gyro_blocks(self) -> list[ErrorStates]:
         """Return the error states of the gyro whose σ is above zero."""
         blocks: list[ErrorStates] = []
-        if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
+        if np.any(self.gyro_scale_sigma) or np.any(self.gyro_misalignment_sigma):
             scale, misalignment = np.asarray(self.gyro_scale_sigma), np.asarray(self.gyro_misalignment_sigma)
             blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
-        if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
+        if np.any(self.gyro_force_sigma) or np.any(self.gyro_cross_force_sigma):
             along, across = np.asarray(self.gyro_force_sigma), np.asarray(self.gyro_cross_force_sigma)
             blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
-        if _any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
+        if np.any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
             slope = np.asarray(self.gyro_temperature_sigma)
             blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
@@ -313,7 +309,7 @@ Part = TypeVar("Part", States, SensorStates)
 
 
 def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
-    return any(_any(getattr(states, field)) for field in fields)
+    return any(np.any(getattr(states, field)) for field in fields)
 
 
 def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
