@@ -212,7 +212,7 @@ def test_where_nothing_drives_the_bias_the_state_is_refused():
         error_states.GyroTemperature(slope_sigma=[1e-4, 0.0, 1e-4])
 
 
-@pytest.mark.parametrize("runs", [12, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [8, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not(runs):
     """Each unit has its own slope, drawn from the specification; ANEES of attitude and bias at three times, two-sided."""
     scenario = scenarios.scenario_from_toml(TOML)
