@@ -653,7 +653,7 @@ def test_directions_are_independent_errors_that_make_up_the_covariance():
     """Also with a correlated prior: scaled to 1/√(1 + s²) of it, they add up to the covariance that is left."""
     correlated = start().covariance * np.outer([3.0, 1.0, 2.0, 1.0, 1.0, 5.0], [3.0, 1.0, 2.0, 1.0, 1.0, 5.0])
     correlated[0, 1] = correlated[1, 0] = 0.6 * np.sqrt(correlated[0, 0] * correlated[1, 1])
-    initial = dataclasses.replace(start(), covariance=correlated)
+    initial = dataclasses.replace(start(), bias=np.array([0.03, -0.02, 0.04]), covariance=correlated)
     record = plain_record(motion.rest())
     observability = estimation.observability(record, NOISE, initial, IRON)
     where = estimation.smooth(record, NOISE, initial, IRON)

@@ -423,6 +423,13 @@ def test_chosen_states_are_those_named():
     assert part.names == ("gyro.drift", "acc.lever")
     assert part.gyro_fast_bias_sigma == WHOLE.gyro_fast_bias_sigma
     assert WHOLE.select(WHOLE.names) == WHOLE
+    scale, force, *_ = WHOLE.blocks({"mag": "vector", "acc": "direction"})
+    assert dict(zip(scale.components, scale.sigma, strict=True)) == {
+        "x": 1e-3, "xy": 1e-3, "yz": 2e-3, "zx": 1.7e-4, "z": 1.23456789e-4,
+    }  # fmt: skip
+    assert dict(zip(force.components, force.sigma, strict=True)) == {
+        "x": 4.9e-7, "xy": 1e-7, "y": 4.9e-7, "zy": 3.3e-7, "z": 4.9e-7,
+    }  # fmt: skip
     assert WHOLE.names == (
         "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.mounting", "mag.bias", "acc.lever", "acc.correlated",
     )  # fmt: skip
