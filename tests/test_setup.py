@@ -137,6 +137,11 @@ def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
     assert np.sqrt(np.mean(taken[0].sigma ** 2)) == pytest.approx(5e-4)
     np.testing.assert_allclose(taken[0].sigma / taken[0].sigma[0], uneven.sigma / uneven.sigma[0])
     assert taken[1] is rest[0]
+    of_axes = np.array([1e-4, 2e-4, 3e-4])
+    by_axis = dataclasses.replace(filter_setup, sigma={first.sensor: tuple(of_axes)}, measurement_sigma_factor=2.0)
+    level = uneven.sigma / np.sqrt(np.mean(uneven.sigma**2))
+    axes = setup.modelled_record(record, by_axis).vectors[0].sigma_axes
+    np.testing.assert_allclose(axes, 2.0 * level[:, None] * of_axes)
     with pytest.raises(InputError, match="star 1"):
         setup.modelled_record(record, dataclasses.replace(filter_setup, sigma={"star one": 1e-3}))
 
