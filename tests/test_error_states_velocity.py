@@ -543,7 +543,8 @@ def test_the_simulated_hand_moves_as_its_accelerometer_says():
     assert 0.3 < np.sqrt(np.mean(fixed[recording.time > 4.0] ** 2)) < 3.0
 
 
-@pytest.mark.parametrize("other", ["white", pytest.param("coloured", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("other", ["white", "coloured"])
 def test_a_simulated_hand_is_better_known_by_its_bounded_velocity(other):
     """On smooth paths that are not the block's own model; the means of four."""
     inclination: dict[str, list[float]] = {other: [], "bounded": []}
