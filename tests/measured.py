@@ -84,12 +84,34 @@ def record_of(body=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> 
 
 
 EVERY_KIND = (
-    error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
     error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
-    error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
     error_states.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
+    error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
+    error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
 )
 """States of every kind for :func:`record_of` with ``anisotropic``: the largest filter of the default run, compiled once."""
+NEGLIGIBLE = {
+    "gyro scale": {"scale_sigma": 1e-8, "misalignment_sigma": 1e-8},
+    "gyro drift": {"bias_sigma": 1e-9},
+    "mag bias": {"bias_sigma": 1e-12},
+    "force disturbance": {"noise_sigma": 1e-8},
+}
+
+
+def every_kind(held=False, **changes) -> tuple[error_states.ErrorStates, ...]:
+    """Return the states of every kind with changes by block; ``held``: all others at zero by a negligible σ. The kernels are the same."""
+    blocks = {block.name: block for block in EVERY_KIND}
+    for name, block in blocks.items():
+        change = changes.get(name.replace(" ", "_"), NEGLIGIBLE[name] if held else {})
+        blocks[name] = replace(block, **change)
+    return tuple(blocks.values())
+
+
+def beside_silent(*series) -> tuple[VectorMeasurements, ...]:
+    """Return series and, without measurements, the others of :func:`record_of`, for the kernels of :data:`EVERY_KIND`."""
+    names = [measurements.sensor for measurements in series]
+    others = record_of(duration=0.5, anisotropic=True).vectors
+    return (*series, *(other.taken(slice(0)) for other in others if other.sensor not in names))
 
 
 def turn_to(q, other):

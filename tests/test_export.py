@@ -60,7 +60,7 @@ STATES = {
         sensors={"star": SensorStates(bias_sigma=0.01, correlated_sigma=0.02, correlation_time=3.0, frame="fixed")}
     ),
     "hand": States(
-        sensors={"accelerometer": SensorStates(velocity_time=0.5, velocity_sigma=0.5, acceleration_sigma=1.0)}
+        sensors={"accelerometer": SensorStates(velocity_time=0.5, velocity_sigma=0.5, acceleration_time=0.5)}
     ),
 }
 

@@ -23,7 +23,7 @@ STATES = {
     "walk and velocity": (
         error_states.VectorBias(sensor="a", bias_sigma=0.01, rate_random_walk=1e-4),
         error_states.BoundedVelocity(
-            sensor="b", velocity_time=2.0, velocity_sigma=0.01, acceleration_sigma=0.03, strength=1.0
+            sensor="b", velocity_time=2.0, velocity_sigma=0.01, acceleration_time=1.0 / 18.0, strength=1.0
         ),
     ),
 }

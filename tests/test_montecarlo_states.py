@@ -91,11 +91,7 @@ MODELS = {
             gyro_drift_sigma=(2e-5,),
             gyro_drift_time=(20.0,),
             gyro_fast_bias_sigma=3e-5,
-            sensors={
-                "magnetometer": SensorStates(
-                    bias_sigma=0.02, mounting_sigma=0.01, correlated_sigma=2e-3, correlation_time=5.0
-                )
-            },
+            sensors={"magnetometer": SensorStates(bias_sigma=0.02, mounting_sigma=0.01)},
         ),
     ),
     "no error states, plain sensors": ((accelerometer(), magnetometer("heading"), TRACKER), States()),
@@ -196,18 +192,3 @@ def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run(
         rows = slice(None, None, model_plan.every)
         assert np.array_equal(errors_at(replayed.estimate, replayed.record.truth, rows), whole.example_error[run])
         assert np.array_equal(np.sqrt(replayed.estimate.variance[rows]), whole.example_sigma[run])
-
-
-@pytest.mark.slow
-def test_the_filter_with_states_is_as_good_as_it_says():
-    """Over individuals, whose errors are drawn as the states assume: ANEES inside its bounds, and outside with the states left out."""
-    scenario = replace(plan("heading").scenario, duration=10.0)
-    verdicts = []
-    for states in (True, False):
-        filter_setup = setup.FilterSetup.for_scenario(scenario, states=states)
-        model_plan = montecarlo.Plan(
-            scenario=scenario, setup=filter_setup, seed=8, epochs=10, nis_bins=5, individuals=True
-        )
-        verdicts.append(montecarlo.run_plan(model_plan, runs=96, machine="lanes").verdict(np.arange(2, 11, 2), "state"))
-    assert verdicts[0].consistent, verdicts[0].mean
-    assert not verdicts[1].consistent

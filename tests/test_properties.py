@@ -19,9 +19,6 @@ quaternions = (
     .filter(lambda q: np.linalg.norm(q) > 1e-3)
     .map(lambda q: q / np.linalg.norm(q))
 )
-quick = settings(
-    derandomize=True, max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 few = settings(
     derandomize=True, max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -77,7 +74,7 @@ trees = st.recursive(
 )
 
 
-@quick
+@few
 @given(trees)
 def test_json_goes_through_a_file(tmp_path, tree):
     files.write_json(tmp_path / "t.json", tree)

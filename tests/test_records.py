@@ -305,15 +305,12 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
     ("kind", "words"),
     [
         ("recovery", r"Recovered at 3.5 s: 7 measurements of compass .* from 1 s on;"),
-        ("hypotheses", r"From 1 s to 3.5 s hypotheses .* compass left a rotation ambiguous: 7 of them were left"),
         ("lock-out", r"Locked out from 1 s to 3.5 s: 7 measurements of compass were rejected,"),
         ("gap", r"Gap of 2.5 s after 1 s:"),
     ],
 )
 def test_an_event_is_described_by_its_kind(kind, words):
     assert re.match(words, str(records.Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
-    text = str(records.Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
-    assert text.endswith("ambiguous: then one was chosen.")
 
 
 def test_the_listing_of_a_record_has_the_rate_of_each_series():

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from measured import assert_inside, errors_at, series_of
+from measured import series_of
 
-from strapdown import coning, consistency, estimation, montecarlo, quaternion, records, scenarios, units, workflows
+from strapdown import coning, estimation, quaternion, records, scenarios, units, workflows
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
@@ -137,23 +137,13 @@ def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
     assert np.sqrt(np.mean(taken[0].sigma ** 2)) == pytest.approx(5e-4)
     np.testing.assert_allclose(taken[0].sigma / taken[0].sigma[0], uneven.sigma / uneven.sigma[0])
     assert taken[1] is rest[0]
+    of_axes = np.array([1e-4, 2e-4, 3e-4])
+    by_axis = dataclasses.replace(filter_setup, sigma={first.sensor: tuple(of_axes)}, measurement_sigma_factor=2.0)
+    level = uneven.sigma / np.sqrt(np.mean(uneven.sigma**2))
+    axes = setup.modelled_record(record, by_axis).vectors[0].sigma_axes
+    np.testing.assert_allclose(axes, 2.0 * level[:, None] * of_axes)
     with pytest.raises(InputError, match="star 1"):
         setup.modelled_record(record, dataclasses.replace(filter_setup, sigma={"star one": 1e-3}))
-
-
-def test_the_matched_filter_of_a_scenario_is_consistent():
-    # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
-    noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
-    noise_only = scenario(gyro=noise, gyro_preset="", duration=30.0)
-    filter_setup = setup.FilterSetup.for_scenario(noise_only, states=False)
-    filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS["four-sample"])
-    runs, last = 60, []
-    for run in range(runs):
-        record = scenarios.simulate(noise_only, 11, run)
-        start = montecarlo.start(record, filter_setup, 11, run)
-        estimate = setup.run(record, filter_setup, start, full_covariance=True)
-        last.append(consistency.nees(errors_at(estimate, record.truth, -1), estimate.covariance[-1]))
-    assert_inside(np.mean(last) / 6.0, 6, runs)
 
 
 def test_truth_travels_in_the_estimate_file(tmp_path):
@@ -183,49 +173,20 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
     words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors))
     for part in ("quantisation", "lever arm", "correlated noise of the magnetometer"):
         assert part in words
-
-
-def test_with_states_there_is_less_that_is_not_covered():
-    for name in ("spin", "low-orbit", "coning", "tumbling-satellite"):
-        scenario = scenarios.load_scenario(name)
-        filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-        assert setup.unmodelled_errors(scenario.gyro, scenario.sensors)
-        assert (
-            setup.unmodelled_errors(scenario.gyro, scenario.sensors, filter_setup.states, gravity_f=scenario.gravity_f)
-            == ()
-        )
-    held = scenarios.load_scenario("hand-held")
-    part = setup.FilterSetup.for_scenario(held, states=True).states.select(("gyro.drift", "accelerometer.lever"))
-    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, part))
+    some = setup.FilterSetup.for_scenario(held, states=True).states.select(("gyro.drift", "accelerometer.lever"))
+    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, some))
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
     assert "flicker" not in words
 
 
-def test_an_estimate_of_a_setup_with_states_holds_them():
-    scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
-    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-    record = scenarios.simulate(scenario)
-    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
-    estimate = setup.run(record, filter_setup, start, every=10, full_covariance=True)
-    assert estimate.covariance.shape == (301, 6, 6)
-    assert list(estimate.error_states) == ["gyro scale"]
-    plain = setup.run(record, dataclasses.replace(filter_setup, states=None), start, every=10)
-    assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
-
-
-@pytest.mark.parametrize("states", [False, True])
-def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
-    scenario = dataclasses.replace(scenarios.load_scenario("spin" if states else "coning"), duration=10.0)
-    record = scenarios.simulate(scenario, 3)
-    filter_setup = setup.FilterSetup.for_scenario(scenario, states=states)
+def test_smoothing_by_a_setup_is_that_of_the_smoother():
+    record = scenarios.simulate(scenario(duration=10.0), 3)
+    filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     smoothed = setup.smooth(record, filter_setup, start, full_covariance=True)
     modelled = setup.modelled_record(record, filter_setup)
-    kinds = {series.sensor: series.kind for series in modelled.vectors}
-    blocks = filter_setup.states.blocks(kinds) if states else ()
-    same = estimation.smooth(modelled, filter_setup.process_noise, start, blocks, full_covariance=True)
-    assert list(smoothed.error_states or ()) == [block.name for block in blocks]
+    same = estimation.smooth(modelled, filter_setup.process_noise, start, full_covariance=True)
     np.testing.assert_array_equal(smoothed.attitude, same.attitude)
     np.testing.assert_array_equal(smoothed.covariance, same.covariance)
     plain = setup.run(record, filter_setup, start)

@@ -119,21 +119,16 @@ def considered_errors(scenario: Scenario, consider: Consider, path: Trajectory) 
     if consider.g_sensitivity > 0.0:
         middle = 0.5 * (path.stamps[1:] + path.stamps[:-1])
         force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
-    across = [(i, j) for i in axes for j in axes if i != j]
-    entries = (
-        *(("scale factor", consider.scale_factor, turn_rate, f"{AXES[i]}", i, i) for i in axes),
-        *(("misalignment", consider.misalignment, turn_rate, f"{AXES[i]} of {AXES[j]}", i, j) for i, j in across),
-        *(
-            ("g-sensitivity", consider.g_sensitivity, force, f"{AXES[i]} of {AXES[j]}", i, j)
-            for i in axes
-            for j in axes
-        ),
-    )
-    columns = [
-        DeterministicError(name=f"{what}, {where}", rate=sigma * driver[:, [j]] * unit[i])
-        for what, sigma, driver, where, i, j in entries
-        if sigma > 0.0
-    ]
+    pairs = [(i, j) for i in axes for j in axes]
+    columns = []
+    for what, sigma, driver, entries in (
+        ("scale factor", consider.scale_factor, turn_rate, [(i, i) for i in axes]),
+        ("misalignment", consider.misalignment, turn_rate, [(i, j) for i, j in pairs if i != j]),
+        ("g-sensitivity", consider.g_sensitivity, force, pairs),
+    ):
+        for i, j in entries if sigma > 0.0 else ():
+            where = AXES[i] if what == "scale factor" else f"{AXES[i]} of {AXES[j]}"
+            columns.append(DeterministicError(name=f"{what}, {where}", rate=sigma * driver[:, [j]] * unit[i]))
     names = [sensor.name for sensor in scenario.sensors]
 
     def at(name: str) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from strapdown import quaternion, scenarios, vectors
 from strapdown.checks import Array, InputError, count
 from strapdown.estimation.forward import Problem
-from strapdown.estimation.model import Model, assemble
+from strapdown.estimation.model import assemble
 from strapdown.estimation.schedule import Schedule
 from strapdown.estimation.setup import (
     FilterSetup,
@@ -63,16 +63,11 @@ class Trajectory(NamedTuple):
         """The measurements in order of time."""
         return self.problem.events
 
-    @property
-    def sensors(self) -> Sequence[Any]:
-        """Sensors of the scenario."""
-        return self.scenario.sensors
-
     def shifted(self, axis: int, shift: float) -> Schedule:
         """Return the measurements shifted along an axis of their noise: that of a heading pair is in fixed axes, in its reference."""
         events, along = self.events, shift * np.eye(3)[axis]
         values, triads = list(events.series_vector_b), events.triads.copy()
-        for i, (kind, sensor) in enumerate(zip(events.kinds, self.sensors, strict=True)):
+        for i, (kind, sensor) in enumerate(zip(events.kinds, self.scenario.sensors, strict=True)):
             first, moves = events.frames[i]
             rows = slice(first, first + (len(events.series_time[i]) if moves else 1))
             if kind == "attitude":
@@ -86,7 +81,7 @@ class Trajectory(NamedTuple):
     def of_events(self, of: Callable[[VectorMeasurements, Any], Array]) -> Array:
         """Return a number or vector of the measurements of each sensor (m, …) in order of time (events, …)."""
         events = self.events
-        columns = [of(series, sensor) for series, sensor in zip(self.own, self.sensors, strict=True)]
+        columns = [of(series, sensor) for series, sensor in zip(self.own, self.scenario.sensors, strict=True)]
         out = np.empty((len(events.time), *columns[0].shape[1:]) if columns else 0)
         for i, (series, column) in enumerate(zip(self.own, columns, strict=True)):
             mine = events.sensor == i
@@ -168,15 +163,15 @@ def trajectory_of(scenario: Scenario, setup: FilterSetup, epochs: int) -> Trajec
             raise InputError(
                 f"{series.sensor}: sigma is 0; a filter needs a noise greater than zero: give the sensor one, or [filter.sigma]"
             )
-    states = setup.states
-    if states is not None and np.any(states.gyro_temperature_sigma):
-        states = dataclasses.replace(states, gyro_temperature_sigma=0.0)
-    matched = dataclasses.replace(setup, states=states)
-    problem = prepared(record, matched, initial_state(setup, attitude[0]))
-    problem = dataclasses.replace(problem, model=_model(problem))
+    if setup.states is not None:  # states for a bias over temperature are left out
+        setup = dataclasses.replace(setup, states=dataclasses.replace(setup.states, gyro_temperature_sigma=0.0))
+    problem = prepared(record, setup, initial_state(setup, attitude[0]))
+    kinds = dict(zip(problem.events.sensors, problem.events.kinds, strict=True))
+    # With a covariance for each measurement.
+    problem = dataclasses.replace(problem, model=assemble(problem.error_states, kinds, isotropic=False))
     if problem.model.levers.any():
         # The angular acceleration is that of a run: how much it is smoothed depends on the gyro's noise.
-        motion = measured_motion(modelled_record(scenarios.simulate(scenario), matched), matched)
+        motion = measured_motion(modelled_record(scenarios.simulate(scenario), setup), setup)
         problem = dataclasses.replace(problem, motion=motion)
     every = steps // epochs * samples
     return Trajectory(
@@ -187,9 +182,3 @@ def trajectory_of(scenario: Scenario, setup: FilterSetup, epochs: int) -> Trajec
         interval=np.clip(np.searchsorted(edges, stamps[:-1], side="right") - 1, 0, len(edges) - 2),
         kept=np.arange(0, steps * samples + 1, every),
     )
-
-
-def _model(problem: Problem) -> Model:
-    """Return the model of a filter with a covariance for each measurement."""
-    kinds = dict(zip(problem.events.sensors, problem.events.kinds, strict=True))
-    return assemble(problem.error_states, kinds, isotropic=False)

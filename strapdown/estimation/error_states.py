@@ -31,7 +31,6 @@ __all__ = [
     "LeverArm",
     "SensorMounting",
     "VectorBias",
-    "VectorScale",
 ]
 
 AXES = ("x", "y", "z")
@@ -224,31 +223,22 @@ def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     )
 
 
-def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
-    """Return the standard deviations of the entries of a matrix (3, 3); entries of zero are no states, and all zero is refused."""
-    for what, value in zip(units, (diagonal, off_diagonal), strict=True):
-        if np.ndim(value) == 0:
-            positive(f"{name}: {what}", value)  # type: ignore[arg-type]
-    whole = np.zeros((3, 3))
-    on = np.eye(3, dtype=bool)
-    axes = array(f"{name}: {units[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
-    across = array(f"{name}: {units[1]}", np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)), (3, 3))
-    whole[on] = axes
-    whole[~on] = across[~on]
+def _matrix(
+    name: str, diagonal: float | Array, off_diagonal: float | Array, fields: tuple[str, str]
+) -> tuple[tuple[str, ...], Array]:
+    """Return names and σ of those entries of a matrix (3, 3) that are states: not zero, of which there must be one."""
+    axes = array(f"{name}: {fields[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
+    across = array(f"{name}: {fields[1]}", np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)), (3, 3))
     if np.ndim(off_diagonal) == 2 and np.any(np.diag(across) != 0.0):
-        raise InputError(f"{name}: {units[1]} has entries on its diagonal; give those as {units[0]}")
+        raise InputError(f"{name}: {fields[1]} has entries on its diagonal; give those as {fields[0]}")
+    whole = np.where(np.eye(3, dtype=bool), axes, across).ravel()
     if np.any(whole < 0.0):
-        i, j = np.argwhere(whole < 0.0)[0]
-        raise InputError(f"{name}: the sigma of {ENTRIES[3 * i + j]} is {whole[i, j]:g}; it must not be negative")
-    if not whole.any():
-        raise InputError(f"{name}: {units[0]} and {units[1]} are both 0; give one of them, or drop these states")
-    return whole
-
-
-def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
-    """Return names and σ of those entries of a matrix that are states."""
-    nonzero = np.flatnonzero(sigmas.ravel())
-    return tuple(ENTRIES[k] for k in nonzero), np.asarray(sigmas.ravel()[nonzero])
+        k = int(np.argmax(whole < 0.0))
+        raise InputError(f"{name}: the sigma of {ENTRIES[k]} is {whole[k]:g}; it must not be negative")
+    nonzero = np.flatnonzero(whole)
+    if not len(nonzero):
+        raise InputError(f"{name}: {fields[0]} and {fields[1]} are both 0; give one of them, or drop these states")
+    return tuple(ENTRIES[k] for k in nonzero), whole[nonzero]
 
 
 def _units_of_entries(names: tuple[str, ...]) -> Array:
@@ -278,8 +268,8 @@ class GyroScale(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
-        sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
-        components, sigma = _entries(sigmas)
+        fields = ("scale_sigma", "misalignment_sigma")
+        components, sigma = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, fields)
         self._set(
             components=components,
             units=tuple("1" if component in AXES else "rad" for component in components),
@@ -317,8 +307,8 @@ class GyroForce(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check all; the states are the entries of G, row by row; xy is the bias about x per force along y."""
-        sigmas = _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
-        components, sigma = _entries(sigmas)
+        fields = ("along_sigma", "across_sigma")
+        components, sigma = _matrix(self.name, self.along_sigma, self.across_sigma, fields)
         gravity = array(f"{self.name}: gravity_f", self.gravity_f, (3,))
         self._set(components=components, units=("rad s/m",) * len(components), sigma=sigma, gravity_f=gravity)
         if not np.any(self.gravity_f):
@@ -361,11 +351,9 @@ class GyroTemperature(ErrorStates):
 
 
 class _FirstOrder(ErrorStates):
-    """First-order Gauss–Markov states with one correlation time."""
+    """Stationary first-order Gauss–Markov states with one correlation time."""
 
     correlation_time: float
-    stationary_sigma: Array
-    """Stationary standard deviation σ of each state (3,)."""
 
     @property
     def decay(self) -> Array:
@@ -375,7 +363,7 @@ class _FirstOrder(ErrorStates):
     @property
     def density(self) -> Array:
         """2σ²/τ."""
-        return 2.0 * self.stationary_sigma**2 / self.correlation_time
+        return 2.0 * self.sigma**2 / self.correlation_time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -388,27 +376,20 @@ class GyroGaussMarkov(_FirstOrder):
         Stationary standard deviation of the drift, rad/s, by body axis.
     correlation_time : float
         Correlation time of the drift, s.
-    initial_sigma : float or ndarray (3,), optional
-        Standard deviation of the drift at the start, rad/s, by body axis: larger than the stationary one for a drift that settles after
-        switching on. Default: the stationary one.
     name : str, default "gyro drift"
         Name of these error states.
     """
 
     bias_sigma: float | Array
     correlation_time: float
-    initial_sigma: float | Array | None = None
     name: str = "gyro drift"
     components = AXES
     units = ("rad/s",) * 3
 
     def __post_init__(self) -> None:
         """Check all."""
-        stationary = sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
-        if self.initial_sigma is not None:
-            sigma = _spread(f"{self.name}: initial_sigma", self.initial_sigma, "rad/s")
-            self._set(initial_sigma=sigma)
-        self._set(bias_sigma=stationary, stationary_sigma=stationary, sigma=sigma)
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
+        self._set(bias_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
 
     @property
@@ -508,37 +489,6 @@ class LeverArm(ErrorStates):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VectorScale(ErrorStates):
-    """Scale factors and misalignments (soft iron) of a vector sensor: all nine entries of S in ``m_b = (I + S) R_fbᵀ r``, constant.
-
-    Parameters
-    ----------
-    sensor : str
-        Name of the sensor.
-    scale_sigma : float
-        Standard deviation of each entry of S, dimensionless.
-    name : str, default "<sensor> scale"
-        Name of these error states.
-    """
-
-    sensor: str
-    scale_sigma: float
-    name: str = ""
-    components = ENTRIES
-    units = ("1",) * 9
-
-    def __post_init__(self) -> None:
-        """Check the deviation."""
-        self._set(name=self.name or f"{self.sensor} scale")
-        self._set(sigma=np.full(9, positive(f"{self.name}: scale_sigma", self.scale_sigma)))
-
-    @property
-    def effects(self) -> Mapping[str, Effect]:
-        """One entry of S per state."""
-        return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class SensorMounting(ErrorStates):
     """Mounting of a vector sensor: the small constant rotation θ from the body's axes to the sensor's, ``m = (I − [θ]×) R_fbᵀ r``.
 
@@ -616,7 +566,7 @@ class GaussMarkov(_FirstOrder):
         """Check all."""
         self._set(name=self.name or f"{self.sensor} disturbance", units=(self.unit,) * 3)
         sigma = _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit)
-        self._set(noise_sigma=sigma, stationary_sigma=sigma, sigma=sigma)
+        self._set(noise_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
         one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
         if self.frame == "fixed" and len(set(self.sigma)) > 1:
@@ -639,8 +589,8 @@ class BoundedVelocity(ErrorStates):
     first-order coloured noise at high frequency and vanishes at zero, as for every body that stays near one place; a constant part of the
     noise would appear as tilt. With ``position_time`` the position is bounded too: ``ṗ = −p/τ_p + s``, ``ṡ = −s/τ_v + u``, ``v = ṗ``.
 
-    The noise is isotropic. Give two of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time``: with the rates
-    ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, λ = 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
+    The noise is isotropic. The σ of the acceleration is ``σ_v √(λ_p λ_v + (λ_p + λ_v) λ_a)`` with λ = 1/τ (λ_p = 0 without a bounded
+    position).
 
     Parameters
     ----------
@@ -648,11 +598,9 @@ class BoundedVelocity(ErrorStates):
         Name of the accelerometer.
     velocity_time : float
         Time constant τ_v of the velocity, s.
-    velocity_sigma : float, default 0.0
+    velocity_sigma : float
         Stationary σ of each component of v, m/s, fixed axes.
-    acceleration_sigma : float, default 0.0
-        Stationary σ of each component of a, m/s², fixed axes.
-    acceleration_time : float, default 0.0
+    acceleration_time : float
         Time constant τ_a of the acceleration, s.
     position_time : float, default 0.0
         Time constant τ_p of the position, s; 0: the position is not bounded and is no state.
@@ -664,45 +612,23 @@ class BoundedVelocity(ErrorStates):
 
     sensor: str
     velocity_time: float
-    velocity_sigma: float = 0.0
-    acceleration_sigma: float = 0.0
-    acceleration_time: float = 0.0
+    velocity_sigma: float
+    acceleration_time: float
     position_time: float = 0.0
     strength: float = STANDARD_GRAVITY
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check all, and compute the third of the three values of which two are given."""
+        """Check all."""
         self._set(name=self.name or f"{self.sensor} velocity")
-        positive(f"{self.name}: velocity_time", self.velocity_time, unit="s")
-        positive(f"{self.name}: strength", self.strength, unit="m/s²")
+        for field_name, unit in (
+            ("velocity_time", "s"),
+            ("velocity_sigma", "m/s"),
+            ("acceleration_time", "s"),
+            ("strength", "m/s²"),
+        ):
+            positive(f"{self.name}: {field_name}", getattr(self, field_name), unit=unit)
         non_negative(f"{self.name}: position_time", self.position_time, unit="s")
-        three = {"velocity_sigma": "m/s", "acceleration_sigma": "m/s²", "acceleration_time": "s"}
-        values = [
-            non_negative(f"{self.name}: {field_name}", getattr(self, field_name), unit=unit)
-            for field_name, unit in three.items()
-        ]
-        velocity, acceleration, time = values
-        values_given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
-        if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: {values_given}: two must be above zero; the third follows from them")
-        slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
-        if time == 0.0:
-            rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
-            if rate <= 0.0:
-                raise InputError(
-                    f"{self.name}: acceleration_sigma is {acceleration:g} m/s² with a velocity_sigma of {velocity:g} m/s, less than "
-                    f"velocity_time and position_time imply ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
-                )
-            self._set(acceleration_time=1.0 / rate)
-            return
-        ratio = float(np.sqrt(p * slow + (p + slow) / time))
-        if acceleration == 0.0:
-            self._set(acceleration_sigma=ratio * velocity)
-        elif velocity == 0.0:
-            self._set(velocity_sigma=acceleration / ratio)
-        elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {values_given} contradict each other at these times; give two of them")
 
     @property
     def _rates(self) -> Array:

@@ -31,8 +31,7 @@ class Observability(Listed):
     With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the information of the
     measurements is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, including process noise,
     with every state relative to its prior σ, so that rad, T and ppm can be compared. A singular value s of
-    ``√O`` is dimensionless: along its direction the record reduces the σ to ``1/√(1 + s²)`` of the prior σ. In the units of the states
-    these are the rows of ``left``, independent errors of one σ each: ``leftᵀ left = P``.
+    ``√O`` is dimensionless: along its direction the record reduces the σ to ``1/√(1 + s²)`` of the prior σ.
 
     Parameters
     ----------
@@ -44,14 +43,10 @@ class Observability(Listed):
         Standard deviations at the first edge before any measurement, in ``units``.
     start_sigma : ndarray (n,)
         Standard deviations of the same state, at the first edge, after all measurements, in ``units``.
-    final_sigma : ndarray (n,)
-        Standard deviations at the last edge, in ``units``.
     singular_values : ndarray (n,)
         Singular values, dimensionless, in descending order.
     directions : ndarray (n, n)
         Unit directions in the space of states relative to their prior σ, one per row, in the order of the singular values.
-    left : ndarray (n, n)
-        Remaining error of one σ along each direction, one per row, in ``units``.
     threshold : float
         Minimum singular value of an observed direction.
     """
@@ -60,10 +55,8 @@ class Observability(Listed):
     units: tuple[str, ...]
     prior_sigma: Array
     start_sigma: Array
-    final_sigma: Array
     singular_values: Array
     directions: Array
-    left: Array
     threshold: float
 
     @property
@@ -76,67 +69,49 @@ class Observability(Listed):
         """Part of each state in directions that are not observed (n,): 0 fully observed, 1 not at all."""
         return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
 
-    def words(self, k: int) -> str:
-        """Return one direction as text: states with their components relative to the prior σ, and the remaining σ in their units.
-
-        Parameters
-        ----------
-        k : int
-            Index of the direction.
-
-        Returns
-        -------
-        str
-            States with large components in the direction, the largest first.
-        """
-        size = np.abs(self.directions[k])
-        large = [i for i in np.argsort(-size, kind="stable") if size[i] >= NAMED * size.max()]
-        relative = self.directions[k] * np.sign(self.directions[k, large[0]])
-        parts = [f"{relative[i]:+.2f} {self.states[i]} ({abs(self.left[k, i]):.2g} {self.units[i]})" for i in large]
-        return " ".join(parts).removeprefix("+")
-
     def listing(self) -> Table:
-        """Return the σ of each state, and each direction with its singular value, as a table."""
+        """Return the σ of each state, and the weakest directions with their singular values, as a table."""
         n, prior = len(self.states), self.prior_sigma
-        sigmas = (prior, self.start_sigma / prior, self.final_sigma / prior)
+        names = map(", ".join, zip(self.states, self.units, strict=True))
         weakest = range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
-        columns = (Column(label, digits=3) for label in ("prior σ", "start/prior", "final/prior"))
         return Table(
             f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)",
-            ("state", *columns, Column("unobserved", shown="{:.2f}".format)),
-            list(zip(map(", ".join, zip(self.states, self.units, strict=True)), *sigmas, self.unobserved, strict=True)),
+            (
+                "state",
+                Column("prior σ", digits=3),
+                Column("start/prior", digits=3),
+                Column("unobserved", shown="{:.2f}".format),
+            ),
+            list(zip(names, prior, self.start_sigma / prior, self.unobserved, strict=True)),
             [
-                "singular value: the weakest directions, each state relative to its prior σ (and the remaining σ)",
-                *(f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in weakest),
+                "singular value: the weakest directions, each state relative to its prior σ",
+                *(f"{self.singular_values[k]:14.3g}: {self._words(k)}" for k in weakest),
             ],
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON, in SI units.
+        """Return everything as plain values for JSON, in SI units; the directions as rows, each state relative to its prior σ.
 
         Returns
         -------
         dict
-            Rank and threshold, the σ of each state, and each direction with its singular value.
+            Rank and threshold, the σ of each state, singular values and directions.
         """
-        sigmas = {
-            name: getattr(self, name).tolist() for name in ("prior_sigma", "start_sigma", "final_sigma", "unobserved")
-        }
-        states = {"state": self.states, "unit": self.units, **sigmas}
-        directions = {
-            "singular_value": self.singular_values.tolist(),
-            "in_prior_sigma": [
-                dict(zip(self.states, direction, strict=True)) for direction in self.directions.tolist()
-            ],
-            "one_sigma_left": [dict(zip(self.states, sigmas, strict=True)) for sigmas in self.left.tolist()],
-        }
+        arrays = ("prior_sigma", "start_sigma", "unobserved", "singular_values", "directions")
         return {
             "rank": self.rank,
             "threshold": self.threshold,
-            "singular_value_unit": "prior sigma over sigma of the measurements",
-            "states": [dict(zip(states, row, strict=True)) for row in zip(*states.values(), strict=True)],
-            "directions": [dict(zip(directions, row, strict=True)) for row in zip(*directions.values(), strict=True)],
+            "states": list(self.states),
+            "units": list(self.units),
+            **{name: getattr(self, name).tolist() for name in arrays},
         }
+
+    def _words(self, k: int) -> str:
+        """Return the k-th direction as text: states with large components relative to the prior σ, the largest first."""
+        size = np.abs(self.directions[k])
+        large = [i for i in np.argsort(-size, kind="stable") if size[i] >= NAMED * size.max()]
+        relative = self.directions[k] * np.sign(self.directions[k, large[0]])
+        return " ".join(f"{relative[i]:+.2f} {self.states[i]}" for i in large).removeprefix("+")
 
 
 def state_names(blocks: Sequence[ErrorStates]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -199,7 +174,7 @@ def observability(
     # The symmetric root of the correlation rotates the states as little as possible: not at all if the prior is diagonal.
     root, inverse = (vector * np.sqrt(value)) @ vector.T, (vector / np.sqrt(value)) @ vector.T
     left, direction = np.linalg.eigh(inverse @ (P / np.outer(sigma, sigma)) @ inverse)
-    left = np.clip(left, 1e-15, 1.0)
+    left = np.clip(left, 1e-15, 1.0)  # of the prior variance
     directions = (root @ direction).T
     names, units = state_names(blocks)
     return Observability(
@@ -207,10 +182,8 @@ def observability(
         units=units,
         prior_sigma=sigma,
         start_sigma=np.sqrt(np.diag(P)),
-        final_sigma=np.sqrt(np.diag(covariance[-1])),
         singular_values=np.sqrt(1.0 / left - 1.0),
         directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
-        left=directions * np.sqrt(left)[:, None] * sigma,
         threshold=threshold,
     )
 

@@ -52,10 +52,11 @@ class ProcessNoise:
 
     def __post_init__(self) -> None:
         """Check both."""
-        positive("angle_random_walk", self.angle_random_walk, unit="rad/√s")
-        non_negative("rate_random_walk", self.rate_random_walk, unit="rad/s/√s")
-        for name, unit in (("angle_random_walk", "rad/√s"), ("rate_random_walk", "rad/s/√s")):
-            if getattr(self, name) > LARGEST_NOISE:
+        for name, unit, check in (
+            ("angle_random_walk", "rad/√s", positive),
+            ("rate_random_walk", "rad/s/√s", non_negative),
+        ):
+            if check(name, getattr(self, name), unit=unit) > LARGEST_NOISE:
                 raise InputError(f"{name} is {getattr(self, name):g} {unit}, more than any gyro has; check the unit")
 
 

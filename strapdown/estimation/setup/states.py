@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from strapdown import units
-from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.checks import InputError, array, known_keys, non_negative, one_of, positive
 from strapdown.estimation.error_states import (
     BoundedVelocity,
     ErrorStates,
@@ -42,14 +42,9 @@ def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entrie
     return tuple(tuple(row) if isinstance(row, list) else row for row in rows)
 
 
-def _any(value: Entries) -> bool:
-    return bool(np.any(np.asarray(value) > 0.0))
-
-
 VELOCITY = {
     "velocity_time": "s",
     "velocity_sigma": "m/s",
-    "acceleration_sigma": "m/s²",
     "acceleration_time": "s",
     "position_time": "s",
 }
@@ -82,11 +77,9 @@ class SensorStates:
         σ of the position of an accelerometer relative to the point that does not accelerate, on each body axis, m.
     velocity_time : float, default 0.0
         Correlation time of the velocity of a hand-held unit, s, for the acceleration that its accelerometer measures
-        (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give also two of the next three.
+        (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give also the next two.
     velocity_sigma : float, default 0.0
         Stationary σ of each component of the velocity, m/s, fixed axes.
-    acceleration_sigma : float, default 0.0
-        Stationary σ of each component of the acceleration, m/s², fixed axes.
     acceleration_time : float, default 0.0
         Correlation time of the acceleration, s.
     position_time : float, default 0.0
@@ -102,7 +95,6 @@ class SensorStates:
     lever_arm_sigma: Entries = 0.0
     velocity_time: float = 0.0
     velocity_sigma: float = 0.0
-    acceleration_sigma: float = 0.0
     acceleration_time: float = 0.0
     position_time: float = 0.0
 
@@ -110,7 +102,7 @@ class SensorStates:
         """Check every field."""
         for name, unit in (("mounting_sigma", "rad"), ("bias_sigma", ""), ("lever_arm_sigma", "m")):
             value = _entries(name, getattr(self, name), (3,), unit)
-            if name != "lever_arm_sigma" and _any(value) and not np.all(value):
+            if name != "lever_arm_sigma" and np.any(value) and not np.all(value):
                 raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
             object.__setattr__(self, name, value)
         non_negative("correlated_sigma", self.correlated_sigma)
@@ -137,14 +129,14 @@ class SensorStates:
         one_of(f"{sensor}: kind", kind, KINDS)
         strength = 1.0 if kind == "vector" else gravity
         blocks: list[ErrorStates] = []
-        if _any(self.mounting_sigma):
+        if np.any(self.mounting_sigma):
             blocks.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
-        if _any(self.bias_sigma):
+        if np.any(self.bias_sigma):
             # Only beside a velocity is the vector known to be a specific force.
             unit = "m/s²" if kind == "vector" and self.velocity_time > 0.0 else "1"
             bias_sigma = np.asarray(self.bias_sigma)
             blocks.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
-        if _any(self.lever_arm_sigma):
+        if np.any(self.lever_arm_sigma):
             blocks.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
         if self.correlated_sigma > 0.0:
             blocks.append(
@@ -233,14 +225,14 @@ class States(ByValue):
     def _gyro_blocks(self) -> list[ErrorStates]:
         """Return the error states of the gyro whose σ is above zero."""
         blocks: list[ErrorStates] = []
-        if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
-            scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
+        if np.any(self.gyro_scale_sigma) or np.any(self.gyro_misalignment_sigma):
+            scale, misalignment = np.asarray(self.gyro_scale_sigma), np.asarray(self.gyro_misalignment_sigma)
             blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
-        if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
-            along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
+        if np.any(self.gyro_force_sigma) or np.any(self.gyro_cross_force_sigma):
+            along, across = np.asarray(self.gyro_force_sigma), np.asarray(self.gyro_cross_force_sigma)
             blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
-        if _any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
-            slope = _spread(self.gyro_temperature_sigma, 0.0)[0]
+        if np.any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
+            slope = np.asarray(self.gyro_temperature_sigma)
             blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
             blocks.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
@@ -317,7 +309,7 @@ Part = TypeVar("Part", States, SensorStates)
 
 
 def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
-    return any(_any(getattr(states, field)) for field in fields)
+    return any(np.any(getattr(states, field)) for field in fields)
 
 
 def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
@@ -326,15 +318,6 @@ def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names:
     dropped = [field for part, fields in parts.items() if f"{owner}.{part}" not in names for field in fields]
     dropped += [beside for field in dropped for beside in _BESIDE.get(field, ())]
     return replace(states, **{field: getattr(none, field) for field in dropped})
-
-
-def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
-    """Return σ of a matrix's diagonal entries (3,) and of its other entries (3, 3), with zeros on the diagonal."""
-    on = np.broadcast_to(np.asarray(diagonal, np.float64), (3,)).copy()
-    off = np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)).copy()
-    if np.ndim(off_diagonal) == 0:
-        np.fill_diagonal(off, 0.0)
-    return on, off
 
 
 # ------------------------------------------------------------------------------------------------------------------------- files
@@ -369,7 +352,6 @@ SENSOR_FORM: tables.Form = {
     "lever_arm_sigma": tables.METRES,
     "velocity_time": tables.SECONDS,
     "velocity_sigma": _SPEED,
-    "acceleration_sigma": tables.METRES_PER_SECOND_SQUARED,
     "acceleration_time": tables.SECONDS,
     "position_time": tables.SECONDS,
 }
