@@ -638,7 +638,8 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     simulated_case = case(1, duration=300.0)
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
     compared = tuning.compare([simulated_case], off, BELIEVED)
-    nees = {course.of: course for course in compared.after.nees}
+    course, *others = compared.after.courses
+    nees = {other.of: other for other in others}
     assert set(nees) == {"attitude", "bias"}
     # Spans of even length: their mean, weighted alike, is that of all epochs.
     mean = (np.nanmean(nees["attitude"].mean) + np.nanmean(nees["bias"].mean)) / 2.0
@@ -655,11 +656,11 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert low < 1.0 < high
     by_sensor = [(s.time, s.nis, np.full(len(s.time), s.innovation.shape[1])) for s in estimate.innovations.values()]
     time, nis, degrees = (np.concatenate(part) for part in zip(*by_sensor, strict=True))
-    edges = np.linspace(time.min(), time.max() + 1e-9, len(compared.after.nis_course) + 1)
+    edges = np.linspace(time.min(), time.max() + 1e-9, len(course.mean) + 1)
     sums, numbers = (np.histogram(time, edges, weights=weights)[0] for weights in (nis, degrees))
-    np.testing.assert_allclose(compared.after.nis_course, sums / numbers, rtol=1e-9)
-    np.testing.assert_array_equal(compared.after.nis_degrees, numbers)
-    assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
+    np.testing.assert_allclose(course.mean, sums / numbers, rtol=1e-9)
+    assert course.bounds == consistency.mean_bounds(1, np.median(numbers), 0.99)
+    assert compared.before.courses[2].mean.mean() < 0.5 * nees["bias"].mean.mean()
     figure = drawing.before_and_after(compared, title="both")
     assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == [
         "NIS per degree of freedom\n(log scale)",
@@ -667,11 +668,11 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
         "NEES of the bias",
     ]
     for line, filter_ in zip(figure.axes[0].lines, (compared.before, compared.after), strict=False):
-        np.testing.assert_array_equal(line.get_ydata(), filter_.nis_course[filter_.nis_degrees > 0])
+        np.testing.assert_array_equal(line.get_ydata(), filter_.courses[0].mean)
     bare = dataclasses.replace(simulated_case, record=dataclasses.replace(simulated_case.record, truth=None))
     assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
     beside = dataclasses.replace(bare, true_attitude=simulated_case.record.truth.attitude)
-    assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.nees] == ["attitude"]
+    assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.courses] == ["NIS", "attitude"]
 
 
 @pytest.mark.parametrize("mode", [0.01, 0.3, 0.8, 1.2])

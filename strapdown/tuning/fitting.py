@@ -545,17 +545,18 @@ class _Errors(NamedTuple):
 def _errors(objective: Objective, best: Optimum) -> _Errors:
     """Return the errors of the best point: by the information, or by the sandwich for a misfit or a composite objective."""
     local, information = best.local, best.local.information
-    if objective.curvature is not None:  # the curvature with that of the priors, if positive definite
-        own = objective.curvature(best.point) + information - local.derivatives.information
+    curvature = objective.curvature(best.point)
+    if curvature is not None:  # with that of the priors, if positive definite
+        own = curvature + information - local.derivatives.information
         information = own if np.linalg.eigvalsh(own)[0] > 0.0 else information
     covariance, robust = covariances(information, local.derivatives.score)
-    curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
-    misfit = bool(np.any(sandwich > MISFIT * curvature))
+    standard, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    misfit = bool(np.any(sandwich > MISFIT * standard))
     # A likelihood whose standard errors are too small by a factor falls too fast by its square.
     swollen = np.ones(len(best.point))
     if misfit or objective.composite:
-        swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
-    return _Errors(covariance, swollen * curvature, swollen, misfit)
+        swollen = np.maximum(sandwich / standard, 0.0 if objective.composite else 1.0)
+    return _Errors(covariance, swollen * standard, swollen, misfit)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
@@ -14,7 +14,7 @@ from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
 from strapdown.tuning.residual_checks import examined, with_misfit_flag
-from strapdown.tuning.validation import Comparison, compare
+from strapdown.tuning.validation import compare
 
 GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
@@ -44,13 +44,8 @@ def objective_for(
         raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
     if truth:
         return error_objective(cases, setup, names, threads=threads)
-    objective = (
-        contaminated_likelihood(cases, setup, names, threads=threads)
-        if gate
-        else likelihood(cases, setup, names, spacing=spacing, threads=threads)
-    )
-    # If eight points run at once, the threads run searches, otherwise records and points.
-    return dataclasses.replace(objective, threads=1) if isinstance(objective, Likelihood) else objective
+    # The threads run searches, because eight points run at once.
+    return contaminated_likelihood(cases, setup, names) if gate else likelihood(cases, setup, names, spacing=spacing)
 
 
 def tune(
@@ -107,33 +102,21 @@ def tune(
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(objective, Likelihood) or (objective.composite and len(cases) == 1) else 1,
+        threads=1 if truth and len(cases) > 1 else threads,
         progress=progress,
     )
-    gated = tuned_gate(objective, result) if isinstance(objective, Likelihood) and objective.mixed else None
-    if gated is not None and gated.gate is not None:
-        result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=gated.gate))
-    result = dataclasses.replace(result, gate=gated, comparison=_compared(held, setup, result, objective, threads))
-    result = dataclasses.replace(result, measure="likelihood" + " of the errors" * truth)
-    return _examined(cases, setup, result)
-
-
-def _compared(
-    held: Sequence[Case], before: FilterSetup, result: Tuning, objective: Objective, threads: int
-) -> Comparison | None:
-    """Return the filter before and after on held-out data; None if there are none."""
-    if not held:
-        return None
-    comparison = compare(held, before, result.setup, threads=threads)
-    if isinstance(objective, Likelihood) and objective.mixed:  # the likelihood after tuning includes the gate
-        likely = log_likelihood(held, objective, result)
-        comparison = dataclasses.replace(comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely))
-    return comparison
-
-
-def _examined(cases: Sequence[Case], before: FilterSetup, result: Tuning) -> Tuning:
-    """Return the tuning with tests for errors that it does not model."""
-    tested = examined(cases, before, result)
-    for check in sorted(tested, key=lambda check: check.severity)[-1:]:
-        result = with_misfit_flag(result, check)
-    return dataclasses.replace(result, unmodelled=tested)
+    result = replace(result, measure="likelihood" + " of the errors" * truth)
+    if isinstance(objective, Likelihood) and gate:
+        gated = tuned_gate(objective, result)
+        tuned = result.setup if gated.gate is None else replace(result.setup, gate=gated.gate)
+        result = replace(result, gate=gated, setup=tuned)
+    if held:
+        comparison = compare(held, setup, result.setup, threads=threads)
+        if isinstance(objective, Likelihood) and gate:  # the likelihood after tuning includes the gate
+            likely = log_likelihood(held, objective, result)
+            comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+        result = replace(result, comparison=comparison)
+    tested = examined(cases, setup, result)
+    if tested:
+        result = with_misfit_flag(result, max(tested, key=lambda check: check.severity))
+    return replace(result, unmodelled=tested)
