@@ -446,17 +446,10 @@ def test_recovery_over_200_records(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("corner", "ramp"), [((1 << 17, 1000.0, 20.0), 0.0), ((1 << 14, 200.0, 20.0), 20.0)], ids=["long", "ramp"]
-)
-def test_intervals_cover_over_200_seeds(corner, ramp):
-    inside, supported, ratio = coverage(200, *corner, ramp=ramp)
-    share = inside.mean(axis=0)[: 5 if ramp else 4]
+def test_intervals_cover_with_a_ramp_over_200_seeds():
+    inside, _, _ = coverage(200, 1 << 14, 200.0, 20.0, ramp=20.0)
+    share = inside.mean(axis=0)
     assert np.all((share >= 0.91) & (share <= 0.98)), share
-    if not ramp:
-        assert np.all(supported[:, :4])
-        assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
-        assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01
 
 
 def test_terms_that_are_not_there_are_bounded_not_invented():
