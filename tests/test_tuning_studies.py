@@ -186,8 +186,7 @@ def rmse(case: tuning.Case, filter_setup: FilterSetup) -> float:
 
 @pytest.mark.parametrize("files", [slice(4, 5), pytest.param(slice(None), marks=pytest.mark.slow)], ids=["one", "all"])
 def test_recordings_tuned_on_their_first_halves_are_likelier_in_their_second_and_no_worse(broad, files):
-    filter_setup = tuning.recording_setup()
-    assert filter_setup.attitude_sigma == AhrsParameters().attitude_sigma
+    filter_setup = AhrsParameters().setup
     train, test = tuning.split(recorded(broad, files), 0.5)
     fit = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1)
     assert fit.misfit  # disturbances of a moving hand last: the fit says so
@@ -206,7 +205,7 @@ def test_recordings_tuned_on_their_first_halves_are_likelier_in_their_second_and
 @pytest.mark.parametrize("trial", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (6, 9))])
 def test_innovations_of_a_recording_tune_the_scale_alone_and_leave_no_sigma_too_small(broad, trial):
     """The worst of the eleven before (NEES 10), the slowest, and one with a magnet; all innovations would give the slowest 27."""
-    filter_setup = tuning.recording_setup()
+    filter_setup = AhrsParameters().setup
     names, spacing = tuning.by_innovations(None)
     trials = recorded(broad, slice(trial, trial + 1))
     tuned = tuning.tune(trials, filter_setup, names, spacing=spacing, starts=1).setup

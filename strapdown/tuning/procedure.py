@@ -20,34 +20,6 @@ GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
 
 
-def objective_for(
-    cases: Sequence[Case],
-    setup: FilterSetup,
-    names: Sequence[str],
-    *,
-    truth: bool = False,
-    gate: bool = False,
-    spacing: float = 0.0,
-    threads: int = 1,
-) -> Objective:
-    """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
-
-    ``truth``: likelihood of the errors against the truth, of the filter as used, including its gate. Innovations are those of the filter
-    without its gate, because the likelihood of accepted ones increases as the gate becomes narrower; ``gate``: model outliers. ``spacing``:
-    minimum time between the samples of a sensor that are used, s.
-    """
-    if spacing > 0.0 and truth:
-        raise InputError(
-            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
-        )
-    if gate and (truth or spacing > 0.0):
-        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
-    if truth:
-        return error_objective(cases, setup, names, threads=threads)
-    # The threads run searches, because eight points run at once.
-    return contaminated_likelihood(cases, setup, names) if gate else likelihood(cases, setup, names, spacing=spacing)
-
-
 def tune(
     cases: Sequence[Case],
     setup: FilterSetup,
@@ -75,13 +47,16 @@ def tune(
     names : sequence of str, optional
         Parameters to tune; those of :data:`GATED` imply ``gate``. Default: :func:`default_names`.
     priors, starts, factor, seed, threads, progress : optional
-        As for :func:`fit`; the threads process records if there is one search at a time.
+        As for :func:`fit`; against a truth the threads process records if there are several.
     gate : bool, default False
         Model outliers, and set the gate where an outlier is more likely.
     held : sequence of Case, optional
         Held-out data (:func:`split`), on which the filter before and after tuning are compared.
-    truth, spacing : optional
-        As for :func:`objective_for`.
+    truth : bool, default False
+        Maximise the likelihood of the errors against the truth, of the filter as used, including its gate. Default: that of the innovations
+        of the filter without its gate, because the likelihood of accepted ones increases as the gate becomes narrower.
+    spacing : float, default 0
+        Minimum time between the measurements of a sensor that are used, s.
 
     Returns
     -------
@@ -95,17 +70,28 @@ def tune(
     """
     gate = gate or any(name in GATED for name in names or ())
     wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
-    objective = objective_for(cases, setup, wanted, truth=truth, gate=gate, spacing=spacing, threads=threads)
+    if spacing > 0.0 and truth:
+        raise InputError(
+            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
+        )
+    if gate and (truth or spacing > 0.0):
+        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
+    objective: Objective
+    if truth:
+        objective = error_objective(cases, setup, wanted, threads=threads)
+    elif gate:
+        objective = contaminated_likelihood(cases, setup, wanted)
+    else:
+        objective = likelihood(cases, setup, wanted, spacing=spacing)
     result = fit(
         objective,
         priors=priors,
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=1 if truth and len(cases) > 1 else threads,
+        threads=1 if truth and len(cases) > 1 else threads,  # searches, unless records are evaluated in parallel
         progress=progress,
     )
-    result = replace(result, measure="likelihood" + " of the errors" * truth)
     if isinstance(objective, Likelihood) and gate:
         gated = tuned_gate(objective, result)
         tuned = result.setup if gated.gate is None else replace(result.setup, gate=gated.gate)
