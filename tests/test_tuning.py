@@ -474,7 +474,7 @@ AS_IT_RUNS = {
     "plain": BELIEVED,
     "gate": dataclasses.replace(BELIEVED, gate=Gate(probability=0.99)),
     "Huber": dataclasses.replace(BELIEVED, robust=Robust(kind="huber")),
-    "states": dataclasses.replace(BELIEVED, states=States(gyro_scale_sigma=1e-3)),
+    "states": dataclasses.replace(BELIEVED, states=States(gyro_scale_sigma=(0.0, 0.0, 1e-3))),
 }
 
 

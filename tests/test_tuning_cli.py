@@ -47,7 +47,7 @@ def wrong(tmp_path):
 @pytest.fixture
 def scaled(tmp_path):
     """A record whose gyro has a scale factor, given by its scenario."""
-    scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3)))
+    scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.array([0.0, 0.0, 2e-3])))
     path = tmp_path / "scaled.h5"
     record = scenarios.simulate(scenario, 2)
     recordfiles.write_record(path, record)
@@ -187,7 +187,7 @@ def struck_record(scenario, seed):
 @pytest.mark.slow
 def test_outliers_beside_optional_states(succeeds, tmp_path):
     out = tmp_path / "states.toml"
-    spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.full(3, 2e-3))
+    spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.array([0.0, 0.0, 2e-3]))
     recordfiles.write_record(tmp_path / "struck.h5", struck_record(dataclasses.replace(SCENARIO, gyro=spec), 2))
     options = ("--states", "--gate", "--free", "star 1.sigma,star 2.sigma", "--starts", 1, "--holdout", 0.3)
     succeeds("tune", tmp_path / "struck.h5", *options, "-o", out)
