@@ -33,8 +33,8 @@ SIGMA = 1e-7 / STRENGTH
 """What the magnetometer's noise is of a direction, rad."""
 
 
-def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
-    """A hand-held motion of a minute with a magnetometer and a star."""
+def scenario(gyro=None, magnetometer=None, star=None, duration=40.0) -> scenarios.Scenario:
+    """A hand-held motion with a magnetometer and a star."""
     return scenarios.Scenario(
         motion=waves(((0.5, 0.0, 0.0), 0.11), ((0.0, 0.4, 0.0), 0.07, 1.0), ((0.0, 0.0, 0.6), 0.05, 2.0)),
         gyro=GyroSpec(**{"angle_random_walk": WALK, "rate_random_walk": 1e-5, **(gyro or {})}),
@@ -47,7 +47,7 @@ def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
             ),
         ),
         rate=50.0,
-        duration=60.0,
+        duration=duration,
     )
 
 
@@ -163,6 +163,7 @@ def test_the_first_cause_is_the_one(case):
 @pytest.mark.slow
 @each_case
 def test_the_first_cause_is_the_one_in_95_of_100(case):
+    case = replace(case, scenario=replace(case.scenario, duration=60.0))
     assert sum(named(diagnosed(case, seed)) == (case.name, case.of) for seed in range(100, 200)) >= 95
 
 
@@ -291,7 +292,7 @@ def test_a_record_without_measurements_is_refused():
 
 def test_missing_and_outlying_measurements_do_not_disturb():
     """NaN rows and stamps outside the record are left out; shifting stamps moves some across its ends."""
-    record = LATE.change(scenarios.simulate(scenario(), seed=5))
+    record = LATE.change(scenarios.simulate(scenario(duration=60.0), seed=5))
     first, second = record.vectors
     holes = first.vector_b.copy()
     holes[::7] = np.nan
@@ -405,7 +406,7 @@ WITH_RECORD = ("check", "out/estimate.h5", "--record", "record.h5", "--json", "c
 
 def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
     """A rate random walk a tenth of the truth: the NIS hardly shows it, the likelihood does, and no output may say both."""
-    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}), 0)
+    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}, duration=60.0), 0)
     assert run("check", "out/estimate.h5")[0] == 3  # the statistics alone
     status, said, error = run(*WITH_RECORD)
     said = " ".join(said.split())
@@ -442,7 +443,7 @@ def test_a_gate_that_refuses_the_outliers_leaves_nothing_to_explain(run, tmp_pat
 
 def test_of_a_robust_filter_the_causes_are_no_part_of_the_verdict(run, tmp_path):
     """It weighs what the search for causes takes whole: outliers are a cause there, and none of its faults."""
-    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}), 0, "--robust", "huber")
+    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}, duration=60.0), 0, "--robust", "huber")
     alone = run("check", "out/estimate.h5")[0]
     status, said, error = run(*WITH_RECORD)
     assert (status, error) == (alone, "")

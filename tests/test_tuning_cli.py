@@ -47,7 +47,9 @@ def wrong(tmp_path):
 @pytest.fixture
 def scaled(tmp_path):
     """A record whose gyro has a scale factor, given by its scenario."""
-    scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.array([0.0, 0.0, 2e-3])))
+    scenario = dataclasses.replace(
+        SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.array([0.0, 0.0, 2e-3]))
+    )
     path = tmp_path / "scaled.h5"
     record = scenarios.simulate(scenario, 2)
     recordfiles.write_record(path, record)
