@@ -84,6 +84,10 @@ def error_objective(
     problem = make_problem(cases, filter_setup, free, threads=threads)
     base = with_engine(problem)
     references = tuple(_spread(base, number) for number in range(len(base.cases)))
+    if len({known.bias is None for known in references}) > 1:
+        raise InputError(
+            "some records have a true bias, others a reference attitude alone; tune on records of one kind"
+        )
     return ErrorObjective(**vars(problem), base=base, references=references)
 
 
