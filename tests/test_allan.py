@@ -3,14 +3,13 @@
 The records come from this file's own simulator, not from the package's gyro.
 """
 
-import functools
 import itertools
 import math
-import multiprocessing
+import os
 import re
-import threading
+import subprocess
+import sys
 import types
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import allantools
@@ -26,7 +25,6 @@ from scipy.stats import chi2, norm
 from sims import allan as sim
 from strapdown import allan, units
 from strapdown.checks import InputError
-from strapdown.consistency.timeaverage import effective_samples
 from strapdown.kernels.allan import accumulate, second_difference_squares
 from strapdown.kernels.machine import compiled
 
@@ -104,7 +102,6 @@ def test_increments_and_rates_give_the_same():
     rate = simulate(3, 3000, dt, N=1e-3, K=1e-4)
     a, b = allan.allan_deviation(rate, dt), allan.allan_deviation(rate * dt, dt, kind="increments")
     assert_allclose(b.deviation, a.deviation, rtol=1e-10)
-    assert_allclose(allan.fit_noise(rate * dt, dt, kind="increments").upper, allan.fit_noise(rate, dt).upper, rtol=1e-6)
 
 
 def test_kernels_compiled_and_plain_agree_with_exact_sums():
@@ -129,53 +126,56 @@ def test_kernels_compiled_and_plain_agree_with_exact_sums():
         assert_allclose(squares, expected, rtol=1e-14)
 
 
-def test_squares_keep_their_digits_over_many_stretches():
-    phase = np.random.default_rng(6).uniform(0.9, 1.1, 2_000_003) * np.tile([1.0, -1.0], 1_000_002)[:2_000_003]
-    squares = np.empty(1)
+def test_sums_keep_their_digits_over_a_long_record():
+    rate = np.full(500_001, 0.1)  # not a binary fraction: a plain running sum drifts
+    phase, squares = np.empty(len(rate) + 1), np.empty(1)
+    compiled(accumulate)(rate, 0.0, phase)
+    assert phase[-1] == math.fsum(rate)
+    phase = np.random.default_rng(6).uniform(0.9, 1.1, 500_003) * np.resize([1.0, -1.0], 500_003)
     compiled(second_difference_squares)(phase, np.array([1]), np.empty(1), np.empty(1), squares)
     assert_allclose(squares[0], math.fsum(((phase[2:] - phase[1:-1]) - (phase[1:-1] - phase[:-2])) ** 2), rtol=5e-16)
 
 
-def test_phase_keeps_its_digits_over_a_long_record():
-    rate = np.full(2_000_001, 0.1)  # not a binary fraction: a plain running sum drifts
-    phase = np.empty(len(rate) + 1)
-    compiled(accumulate)(rate, 0.0, phase)
-    assert phase[-1] == math.fsum(rate)
+ANALYSES = """
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import allan
+from strapdown.consistency.timeaverage import effective_samples
+
+values = np.random.default_rng(1).standard_normal(40_000)
+gappy = np.where(np.arange(len(values)) == 20_000, np.nan, values)
 
 
-def times_of_other_threads():
-    """Return the CPU time, ns, that other threads of the process take for each of several analyses of up to 200,000 samples."""
-    values = np.random.default_rng(1).standard_normal(200_000)
-    gappy = np.where(np.arange(len(values)) % 90_000 == 0, np.nan, values)
-    temperature = np.linspace(20.0, 30.0, 20_000)
-    calls = [
-        functools.partial(np.linalg.qr, values.reshape(-1, 20)),  # by BLAS
-        functools.partial(allan.allan_deviation, values, 0.01),
-        functools.partial(allan.allan_deviation, gappy[70_000:110_000], 0.01),
-        functools.partial(allan.fit_noise, gappy, 0.01),
-        functools.partial(allan.temperature.fit_temperature, values[:20_000], temperature, 0.01, order=2),
-        functools.partial(effective_samples, values.reshape(-1, 20)),
-    ]
+def time_of_other_threads():
+    tasks = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != threading.get_native_id()]
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks)
 
-    def of_other_threads():
-        tasks = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != threading.get_native_id()]
-        return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks)
 
-    times = []
-    for call in calls:
-        call()  # compiles and imports
-        before = of_other_threads()
-        call()
-        times.append(of_other_threads() - before)
-    return times
+for call in (
+    lambda: allan.allan_deviation(values, 0.01),
+    lambda: allan.allan_deviation(gappy, 0.01),
+    lambda: allan.fit_noise(gappy, 0.01, terms=allan.TERMS[1:2]),
+    lambda: allan.temperature.fit_temperature(values[:20_000], np.linspace(20.0, 30.0, 20_000), 0.01, order=2),
+    lambda: effective_samples(np.resize(values, (10_000, 20))),
+    lambda: np.linalg.qr(np.resize(values, (10_000, 20))),  # by BLAS, whose threads go on for a while
+):
+    call()  # compiles and imports
+    before = time_of_other_threads()
+    call()
+    print(time_of_other_threads() - before)
+"""
+"""Prints the CPU time, ns, that other threads of the process take for a factorisation by BLAS and for analyses of long records."""
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="CPU time of threads is read from Linux's /proc")
-def test_long_sums_wake_no_threads_of_blas(monkeypatch):
+def test_long_sums_wake_no_threads_of_blas():
     """On a busy machine they made the modified deviation 20 times slower."""
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        of_blas, *times = process.submit(times_of_other_threads).result()
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    said = subprocess.run([sys.executable, "-c", ANALYSES], env=environment, capture_output=True, text=True, check=True)
+    *times, of_blas = map(int, said.stdout.split())
     assert of_blas > 1e6
     assert max(times) < 1e6, times
 
@@ -245,8 +245,8 @@ def test_band_covers(alpha):
         record = pure(alpha, [seed, 2], 600)
         result = allan.allan_deviation(record, 1.0, taus=taus)
         inside += (result.lower[0] <= truth) & (truth <= result.upper[0])
-        assert_allclose(chi2.cdf(result.edf * (result.deviation / result.lower) ** 2, result.edf), 0.975)
-        assert_allclose(chi2.cdf(result.edf * (result.deviation / result.upper) ** 2, result.edf), 0.025)
+    assert_allclose(chi2.cdf(result.edf * (result.deviation / result.lower) ** 2, result.edf), 0.975)
+    assert_allclose(chi2.cdf(result.edf * (result.deviation / result.upper) ** 2, result.edf), 0.025)
     # At 60 samples, ten blocks, the noise type is the one found at 8; a wrong one widens or narrows the band a little.
     assert np.all(inside >= 0.90 * 200)
     assert np.all(inside <= 199)
@@ -308,6 +308,8 @@ def test_spectrum_of_the_cosine_transform_is_exact(term, samples):
     assert_allclose(np.diag(transformed), expected, rtol=1e-9)
     if term in ("angle_random_walk", "rate_random_walk"):  # independent coefficients: nothing off the diagonal
         assert_allclose(transformed, np.diag(expected), atol=1e-10 * expected.max())
+    ramp = rows[1:] @ np.arange(samples)
+    assert_allclose(allan.spectrum.ramp_coefficients(samples, np.arange(1, samples)), ramp, atol=1e-11)
 
 
 def test_flicker_spectrum_of_long_records_continues_that_of_short_ones():
@@ -318,12 +320,9 @@ def test_flicker_spectrum_of_long_records_continues_that_of_short_ones():
     j = np.array([8190, 8191, 8192, 8193])
     power = allan.spectrum.expected_power("bias_instability", 1 << 22, 1.0, j) * j
     assert_allclose(power / power[0], 1.0, rtol=1e-4)
-
-
-def test_ramp_coefficients():
-    for samples in (16, 33):
-        expected = dct(np.arange(samples) * 1.0, norm="ortho")[1:]
-        assert_allclose(allan.spectrum.ramp_coefficients(samples, np.arange(1, samples)), expected, atol=1e-11)
+    # Its Allan variance: of few samples below, of many the limit.
+    assert_allclose(allan.flicker_variance([4097]), allan.flicker_variance([4096]), rtol=1e-6)
+    assert_allclose(allan.flicker_variance([10**7]), 2.0 * math.log(2.0) / math.pi, rtol=1e-9)
 
 
 @pytest.mark.parametrize("m", [1, 2, 5, 12, 50])
@@ -349,30 +348,19 @@ def _unit(term, dt):
     return dt ** powers[term]
 
 
-def test_flicker_variance_at_the_joint():
-    """Of few samples: the model's, above."""
-    below, above = allan.flicker_variance([4096]), allan.flicker_variance([4097])
-    assert_allclose(above, below, rtol=1e-6)
-    assert_allclose(allan.flicker_variance([10**7]), 2.0 * math.log(2.0) / math.pi, rtol=1e-9)
-
-
 # Fit
 
 
 def test_fit_recovers_a_record_within_its_errors():
-    dt = 0.1
-    shape = corners(1 << 17, 1000.0, 20.0)
-    truth = {
-        "Q": 1e-6 * shape["Q"] * dt,
-        "N": 1e-6 * shape["N"] * math.sqrt(dt),
-        "B": 1e-6,
-        "K": 1e-6 * shape["K"] / math.sqrt(dt),
-    }
-    record = np.stack([simulate([seed, 4], 1 << 17, dt, **truth) for seed in range(3)], axis=1)
-    fit = allan.fit_noise(record, dt)
+    """The scores are held to 3.5 σ, and the sizes of the errors to those of a record of 2^15 samples."""
+    dt, samples = 0.1, 1 << 15
+    shape = corners(samples, 500.0, 20.0)
+    powers = {"Q": dt, "N": math.sqrt(dt), "B": 1.0, "K": 1.0 / math.sqrt(dt)}
+    truth = {term: 1e-6 * shape[term] * power for term, power in powers.items()}
+    fit = allan.fit_noise(np.stack([simulate([seed, 4], samples, dt, **truth) for seed in range(3)], axis=1), dt)
     assert fit.estimate.shape == (3, 5)
     assert np.all(fit.supported[:, :4])
-    assert np.all(np.abs(fit.estimate[:, :4] / list(truth.values()) - 1.0) < [0.04, 0.03, 0.10, 0.5])
+    assert np.all(np.abs(fit.estimate[:, :4] / list(truth.values()) - 1.0) < [0.08, 0.06, 0.20, 0.6])
     scores = (fit.estimate[:, :4] - list(truth.values())) / np.sqrt(fit.covariance[:, range(4), range(4)])
     assert np.abs(scores).max() < 3.5
     assert np.all(fit.misfit_probability > 1e-3)
@@ -410,7 +398,7 @@ def test_intervals_cover_small_study():
     assert np.all(np.abs(np.sqrt(np.nanmean(error**2, axis=0)) / relative - 1.0) < 0.37), relative
 
 
-@pytest.mark.parametrize("records", [100, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("records", [50, pytest.param(200, marks=pytest.mark.slow)])
 def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen(records):
     """Flicker between corners so near that the record shows it or not by chance: the bounds must hold as the intervals do.
 
@@ -432,9 +420,10 @@ def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen(records):
         inside.append((fit.lower[0] <= truth) & (truth <= fit.upper[0]))
         above.append(fit.upper[0, 1] < B)
         supported.append(fit.supported[0, 1])
+    wide = math.sqrt(200 / records)  # 0.04 is 2.7 σ of two hundred
     assert 0.3 < np.mean(supported) < 0.9
-    assert np.all(np.abs(np.mean(inside, axis=0) - 0.955) < 0.04)
-    assert 0.005 < np.mean(above) < 0.05  # 0.025; one-sided bounds give 0.065 here
+    assert np.all(np.abs(np.mean(inside, axis=0) - 0.955) < 0.04 * wide)
+    assert 0.025 - 0.02 * wide < np.mean(above) < 0.025 + 0.025 * wide  # one-sided bounds give 0.065 here
 
 
 @pytest.mark.slow
@@ -457,30 +446,23 @@ def test_recovery_over_200_records(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("corner", "ramp"), [((1 << 17, 1000.0, 20.0), 0.0), ((1 << 14, 200.0, 20.0), 20.0)], ids=["long", "ramp"]
-)
-def test_intervals_cover_over_200_seeds(corner, ramp):
-    inside, supported, ratio = coverage(200, *corner, ramp=ramp)
-    share = inside.mean(axis=0)[: 5 if ramp else 4]
+def test_intervals_cover_with_a_ramp_over_200_seeds():
+    inside, _, _ = coverage(200, 1 << 14, 200.0, 20.0, ramp=20.0)
+    share = inside.mean(axis=0)
     assert np.all((share >= 0.91) & (share <= 0.98)), share
-    if not ramp:
-        assert np.all(supported[:, :4])
-        assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
-        assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01
 
 
 def test_terms_that_are_not_there_are_bounded_not_invented():
-    """Of twelve records; a slow study takes two hundred."""
+    """Of six records; a slow study takes two hundred."""
     supported, below = np.zeros(5), np.zeros(5)
-    for seed in range(12):
+    for seed in range(6):
         fit = allan.fit_noise(simulate([seed, 8], 4096, 0.01, N=1e-3), 0.01)
         supported += fit.supported[0]
         below += np.isnan(fit.estimate[0]) & (fit.lower[0] == 0.0) & (fit.upper[0] > 0.0)
         assert np.isnan(fit.covariance[0, 0, 1])
-    assert supported[1] == 12
-    assert supported[[0, 2, 3, 4]].sum() <= 1  # each with a chance of 1e-3: two of 48 with one of 0.1 %
-    assert_allclose(supported + below, 12.0)
+    assert supported[1] == 6
+    assert supported[[0, 2, 3, 4]].sum() == 0  # each with a chance of 1e-3
+    assert_allclose(supported + below, 6.0)
 
 
 def test_bound_is_where_the_likelihood_falls():
@@ -637,10 +619,10 @@ def test_misfit_probability_is_one(highest_frequency):
             terms=("angle_random_walk", "rate_random_walk"),
             highest_frequency=highest_frequency,
         ).misfit_probability[0]
-        for seed in range(40)
+        for seed in range(24)
     ]
     for level in (0.2, 0.5):
-        assert abs(np.mean(np.array(probability) < level) - level) < 3.0 * math.sqrt(level * (1.0 - level) / 40)
+        assert abs(np.mean(np.array(probability) < level) - level) < 3.0 * math.sqrt(level * (1.0 - level) / 24)
 
 
 def test_expected_errors_by_the_full_information():
@@ -666,25 +648,21 @@ def test_expected_errors_by_the_full_information():
     )
 
 
-@pytest.mark.parametrize("factor", [1e-12, 1e6])
-def test_units_scale_through(factor):
-    rate = simulate(5, 4096, 1.0, **corners(4096, 100.0, 20.0), R=0.01)
-    fit, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate * factor + 3.0 * factor, 1.0)
-    assert np.array_equal(fit.supported, other.supported)
-    assert_allclose(other.estimate, factor * fit.estimate, rtol=1e-4)
-    assert_allclose(other.upper, factor * fit.upper, rtol=1e-4)
-    stretched = allan.fit_noise(rate, 4.0)
-    powers = np.array([1.0, 0.5, 0.0, -0.5, -1.0])
-    assert_allclose(stretched.upper, fit.upper * 4.0**powers, rtol=1e-4)
-
-
-def test_a_ramp_moves_the_ramp_alone():
+def test_units_scale_through_and_a_ramp_moves_the_ramp_alone():
     rate = simulate(6, 4096, 1.0, **corners(4096, 100.0, 20.0))
-    fit, other = allan.fit_noise(rate, 1.0), allan.fit_noise(rate - 100.0 * np.arange(4096), 1.0)
-    assert_allclose(other.estimate[0, :4], fit.estimate[0, :4], rtol=1e-5)
-    assert_allclose(other.estimate[0, 4], -100.0, rtol=1e-3)
-    assert other.lower[0, 4] < -100.0 + fit.upper[0, 4]
-    assert other.upper[0, 4] > -100.0 - fit.upper[0, 4]
+    fit = allan.fit_noise(rate, 1.0)
+    for factor in (1e-12, 1e6):
+        other = allan.fit_noise(rate * factor + 3.0 * factor, 1.0)
+        assert np.array_equal(fit.supported, other.supported)
+        assert_allclose(other.estimate, factor * fit.estimate, rtol=1e-4)
+        assert_allclose(other.upper, factor * fit.upper, rtol=1e-4)
+    by_increments = allan.fit_noise(4.0 * rate, 4.0, kind="increments")
+    assert_allclose(by_increments.upper, fit.upper * 4.0 ** np.array([1.0, 0.5, 0.0, -0.5, -1.0]), rtol=1e-4)
+    ramp = allan.fit_noise(rate - 100.0 * np.arange(4096), 1.0)
+    assert_allclose(ramp.estimate[0, :4], fit.estimate[0, :4], rtol=1e-5)
+    assert_allclose(ramp.estimate[0, 4], -100.0, rtol=1e-3)
+    assert ramp.lower[0, 4] < -100.0 + fit.upper[0, 4]
+    assert ramp.upper[0, 4] > -100.0 - fit.upper[0, 4]
 
 
 def test_chosen_terms_only():
@@ -692,17 +670,21 @@ def test_chosen_terms_only():
     fit = allan.fit_noise(rate, 1.0, terms=["rate_random_walk", "angle_random_walk"])
     assert fit.terms == ("angle_random_walk", "rate_random_walk")
     assert np.all(np.abs(fit.estimate[0] / [1.0, 0.01] - 1.0) < [0.05, 0.4])
+    # Of n samples of white noise alone σ is known to σ/√(2n).
     only = allan.fit_noise(simulate(7, 4096, 1.0, N=1.0), 1.0, terms=["angle_random_walk"])
     assert only.supported.all()
     assert_allclose(only.upper[0, 0] / only.estimate[0, 0], 1.0 + 1.96 / math.sqrt(2.0 * 4095), rtol=2e-3)
+    assert only.covariance.shape == (1, 1, 1)
+    assert math.sqrt(only.covariance[0, 0, 0]) == pytest.approx(1.0 / math.sqrt(2.0 * 4095), rel=0.03)
 
 
 # Rim
 
 
 def test_table_and_parameters():
+    terms = ("angle_random_walk", "rate_random_walk")
     rate = simulate(8, 1 << 14, 1.0, N=units.DEGREE_PER_ROOT_HOUR)
-    fit = allan.fit_noise(rate, 1.0)
+    fit = allan.fit_noise(rate, 1.0, terms=terms)
     row = next(r for r in allan.table(fit) if r["term"] == "angle_random_walk")
     assert row["symbol"] == "N"
     assert row["unit"] == "°/√h"
@@ -710,18 +692,16 @@ def test_table_and_parameters():
     assert_allclose(row["estimate"], 1.0, rtol=0.03)
     parameters = allan.to_gyro_parameters(fit)
     assert tuple(parameters) == ("angle_random_walk",)
-    assert tuple(allan.upper_bounds(fit)) == ("quantization", "bias_instability", "rate_random_walk", "rate_ramp")
-    assert allan.upper_bounds(fit)["rate_random_walk"] == fit.upper[0, 3]
+    assert allan.upper_bounds(fit) == {"rate_random_walk": fit.upper[0, 1]}
     assert_allclose(parameters["angle_random_walk"], units.DEGREE_PER_ROOT_HOUR, rtol=0.03)
-    three = allan.to_gyro_parameters(allan.fit_noise(np.stack([rate] * 3, axis=1), 1.0))
+    three = allan.to_gyro_parameters(allan.fit_noise(np.stack([rate] * 3, axis=1), 1.0, terms=terms))
     # Three axes weigh the terms together, so that each is judged more sharply than alone.
     assert three["angle_random_walk"] == (three["angle_random_walk"][0],) * 3
     assert_allclose(three["angle_random_walk"], parameters["angle_random_walk"], rtol=3e-3)
     walking = simulate(9, 1 << 14, 1.0, N=units.DEGREE_PER_ROOT_HOUR, K=0.1 * units.DEGREE_PER_ROOT_HOUR)
-    mixed = allan.fit_noise(np.stack([rate, rate, walking], axis=1), 1.0)
-    assert allan.to_gyro_parameters(mixed)["rate_random_walk"] == (0.0, 0.0, mixed.estimate[2, 3])
-    assert allan.upper_bounds(mixed)["rate_random_walk"] == tuple(mixed.upper[:, 3])
-    assert "angle_random_walk" not in allan.upper_bounds(mixed)
+    mixed = allan.fit_noise(np.stack([rate, rate, walking], axis=1), 1.0, terms=terms)
+    assert allan.to_gyro_parameters(mixed)["rate_random_walk"] == (0.0, 0.0, mixed.estimate[2, 1])
+    assert allan.upper_bounds(mixed) == {"rate_random_walk": tuple(mixed.upper[:, 1])}
     total = allan.model_deviation(parameters, [1.0, 100.0], 1.0)["total"]
     assert_allclose(total, allan.allan_deviation(rate, 1.0, taus=[1.0, 100.0]).deviation[0], rtol=0.1)
 
@@ -759,14 +739,6 @@ RECORD = np.random.default_rng(0).standard_normal(200)
 def test_bad_input_is_named(call, words):
     with pytest.raises(InputError, match=words):
         call()
-
-
-def test_the_covariance_of_a_coefficient_is_that_of_the_coefficient_not_of_its_square():
-    """Of n samples of white noise alone σ is known to σ/√(2n)."""
-    n = 20_000
-    fit = allan.fit_noise(np.random.default_rng(5).standard_normal((n, 1)), 1.0, terms=("angle_random_walk",))
-    assert fit.covariance.shape == (1, 1, 1)
-    assert np.sqrt(fit.covariance[0, 0, 0]) == pytest.approx(1.0 / np.sqrt(2.0 * n), rel=0.02)
 
 
 def test_the_units_of_the_coefficients_are_what_their_names_say():

@@ -54,7 +54,7 @@ def test_the_scenario_at_rest_gives_its_preset_back(succeeds, tmp_path):
 ACCELEROMETER = """
 seed = 3
 rate_hz = 50.0
-duration_s = 600.0
+duration_s = 120.0
 
 [motion]
 type = "rest"
@@ -80,8 +80,8 @@ def test_a_simulated_accelerometer_at_rest_gives_the_file_of_kalibr(succeeds, re
     values = {
         name: float(rest.split()[0]) for name, _, rest in (line.partition(": ") for line in lines) if rest[:1].isdigit()
     }
-    assert values["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.02)
-    assert values["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.02)
+    assert values["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.03)
+    assert values["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.03)
     (tmp_path / "unit.toml").write_text(ACCELEROMETER.replace('kind = "vector"\n', ""), encoding="utf-8")
     succeeds("simulate", "unit.toml")
     assert 'simulate it with kind = "vector"' in refusal("allan", "unit.h5", *both, "--out", "other")
@@ -109,10 +109,12 @@ def test_terms_not_seen_are_left_out_and_bounded_in_comments(succeeds, tmp_path)
     assert table["angle_random_walk_deg_per_sqrt_hour"] == [float(f"{v / NOISE:.6g}") for v in fit.estimate[:, 1]]
 
 
-def test_one_column_gives_one_number_for_all_axes(succeeds, tmp_path):
-    np.save(tmp_path / "gyro.npy", white(axes=1)[:, 0])
-    succeeds("allan", "gyro.npy", *AT_100_HZ)
+def test_one_column_gives_one_number_for_all_axes_and_a_name_with_a_line_break_toml(succeeds, tmp_path):
+    name = "at\nrest=1\t.npy"
+    np.save(tmp_path / name, white(4096, axes=1)[:, 0])
+    succeeds("allan", name, *AT_100_HZ)
     spec, text = written(tmp_path)
+    assert list(tomllib.loads(text)) == ["gyro"]
     assert np.ndim(spec.angle_random_walk) == 0
     assert all(isinstance(value, float | int) for value in commented(text).values())
 
@@ -157,13 +159,6 @@ def test_npy_csv_and_units_agree(succeeds, tmp_path):
     succeeds("allan", "gyro.csv", "--out", "b")
     from_npy, from_csv = written(tmp_path, "a")[0], written(tmp_path, "b")[0]
     np.testing.assert_allclose(from_npy.angle_random_walk, from_csv.angle_random_walk, rtol=3e-6)
-
-
-def test_a_name_with_a_line_break_still_gives_toml(succeeds, tmp_path):
-    name = "at\nrest = 1\t.npy"
-    np.save(tmp_path / name, white(4096))
-    succeeds("allan", name, *AT_100_HZ)
-    assert list(tomllib.loads(written(tmp_path)[1])) == ["gyro"]
 
 
 @pytest.mark.parametrize(
@@ -216,7 +211,7 @@ ONE_TERM = {
 @pytest.mark.parametrize("term", allan.TERMS)
 def test_the_round_trip_of_each_term(term):
     spec = ONE_TERM[term]
-    samples = 1 << 16
+    samples = 1 << 15
     edges = DT * np.arange(samples + 1)
     increments = gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(3, 0, "gyro")).increments
     fit = allan.fit_noise(increments, DT, kind="increments")

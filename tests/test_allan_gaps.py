@@ -41,32 +41,29 @@ def test_a_sum_by_hand():
     assert result.samples == 5
 
 
-@pytest.mark.parametrize(
-    ("kind", "lost"), [("white", "single"), ("white", "long"), ("walk", "long"), ("phase", "long")]
-)
-def test_the_estimator_is_unbiased_whatever_the_gaps(kind, lost):
-    """Within 3 % of the variance, though averages count that miss up to three tenths; 10 % where a cut leaves quantisation noise."""
-    mean, spread, truth = over_records(kind, gaps(400, lost), np.array([1, 2, 5, 12, 30]))
-    bias = 0.1 if kind == "phase" else 0.03
-    assert np.all(np.abs(mean - truth) < bias * truth + 4.0 * spread)
-
-
-def test_a_walk_with_single_samples_lost_is_nearly_unbiased():
-    """Averages whose missing samples are not in their middle are of other times: within 4 %."""
-    mean, spread, truth = over_records("walk", gaps(400, "single"), np.array([1, 2, 5, 12, 30]))
-    assert np.all(np.abs(mean - truth) < 0.04 * truth + 4.0 * spread)
-
-
-def over_records(kind: str, known: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean Allan variance over 300 records, its standard error, and its expected value."""
-    records = noise(kind, (300, len(known)), 7)
+def of_records(kind: str, known: np.ndarray, m: np.ndarray, runs: int, seed: int) -> list[allan.AllanDeviation]:
+    records = noise(kind, (runs, len(known)), seed)
     records[:, ~known] = np.nan
-    variances = np.array([allan.allan_deviation(record, 1.0, taus=m).deviation[0] ** 2 for record in records])
-    return (
-        np.nanmean(variances, axis=0),
-        np.nanstd(variances, axis=0) / np.sqrt(300),
-        true_variance(kind, m.astype(float)),
-    )
+    return [allan.allan_deviation(record, 1.0, taus=m) for record in records]
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost", "bias"),
+    [
+        ("white", "single", 0.03),
+        ("white", "long", 0.03),
+        ("walk", "long", 0.03),
+        ("walk", "single", 0.04),  # averages whose missing samples are not in their middle are of other times
+        ("phase", "long", 0.1),  # a cut leaves quantisation noise
+    ],
+)
+def test_the_estimator_is_unbiased_whatever_the_gaps(kind, lost, bias):
+    """Within this share of the variance, though averages count that miss up to three tenths."""
+    m, runs = np.array([1, 2, 5, 12, 30]), 150
+    variances = np.array([result.deviation[0] ** 2 for result in of_records(kind, gaps(400, lost), m, runs, 7)])
+    truth = true_variance(kind, m.astype(float))
+    spread = np.nanstd(variances, axis=0) / np.sqrt(runs)
+    assert np.all(np.abs(np.nanmean(variances, axis=0) - truth) < bias * truth + 4.0 * spread)
 
 
 def test_a_sample_lost_leaves_the_overlapping_estimator():
@@ -78,10 +75,14 @@ def test_a_sample_lost_leaves_the_overlapping_estimator():
     np.testing.assert_allclose(with_gap.edf, whole.edf, rtol=2e-2)
 
 
-@pytest.mark.parametrize(("kind", "lost"), [("white", "long"), ("walk", "single")])
-def test_its_band_covers_the_truth(kind, lost):
-    """95 % intervals over 300 records at each τ up to a tenth of the record: between 89 and 99.5 %."""
-    covers(kind, gaps(500, lost, seed=1), np.array([1, 3, 10, 30, 50]))
+def test_its_band_covers_the_truth():
+    """Of a walk with single samples lost: 95 % intervals at each τ up to a tenth of the record; below, white noise with a long gap."""
+    m, runs = np.array([1, 3, 10, 30, 50]), 200
+    estimates = of_records("walk", gaps(500, "single", seed=1), m, runs, 11)
+    lower, upper = (np.array([getattr(estimate, end)[0] for estimate in estimates]) for end in ("lower", "upper"))
+    truth = true_variance("walk", m.astype(float))
+    share = np.mean((lower**2 <= truth) & (truth <= upper**2), axis=0)
+    assert (np.abs(share - 0.95) < 0.06).all(), share  # four σ
 
 
 @pytest.mark.parametrize(
@@ -107,18 +108,6 @@ def test_a_gap_of_a_tenth(K):
     assert K or np.mean(white) > 0.95
 
 
-def covers(kind: str, known: np.ndarray, m: np.ndarray) -> None:
-    samples, runs = len(known), 300
-    truth = true_variance(kind, m.astype(float))
-    records = noise(kind, (runs, samples), 11)
-    records[:, ~known] = np.nan
-    estimates = [allan.allan_deviation(record, 1.0, taus=m) for record in records]
-    lower, upper = (np.array([getattr(estimate, end)[0] for estimate in estimates]) for end in ("lower", "upper"))
-    share = np.mean((lower**2 <= truth) & (truth <= upper**2), axis=0)
-    assert (share > 0.89).all(), share
-    assert (share < 0.995).all(), share
-
-
 @pytest.mark.parametrize("options", [{}, {"highest_frequency": 20.0}, {"terms": allan.TERMS[:2]}], ids=str)
 def test_the_fit_of_one_segment_is_that_of_its_samples_alone(options):
     x = 1e-3 * noise("white", (1, 4000), 3)[0] + 2e-5 * noise("walk", (1, 4000), 4)[0]
@@ -129,9 +118,9 @@ def test_the_fit_of_one_segment_is_that_of_its_samples_alone(options):
         np.testing.assert_array_equal(getattr(gappy, name), getattr(alone, name), err_msg=name)
 
 
-@pytest.mark.parametrize(("seeds", "least"), [(10, 50), pytest.param(100, 547, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("seeds", "least"), [(6, 29), pytest.param(100, 547, marks=pytest.mark.slow)])
 def test_the_fit_over_stretches_covers_the_truth(seeds, least):
-    """N and K of three axes with long gaps, 60 or 600 intervals of 95 %: ``least`` is four σ below what should hold."""
+    """N and K of three axes with long gaps, 36 or 600 intervals of 95 %: ``least`` is four σ below what should hold."""
     dt, samples = 0.01, 6000
     N, K = 1e-3, 2e-3
     hits = 0
@@ -165,25 +154,19 @@ def test_a_stretch_that_moves_is_seen():
     assert twice == pytest.approx(2.0 * once, rel=1e-6)
 
 
+GAPPY = np.append(np.arange(9.0) % 3, np.nan)
+
+
 @pytest.mark.parametrize(
-    ("values", "words"),
+    ("call", "values", "options", "words"),
     [
-        (np.full(100, np.nan), "at least 64 without a gap are needed"),
-        (np.where(np.arange(500) % 50, 1.0, np.nan), "at least 64 without a gap are needed"),
-        (np.where(np.arange(500) == 250, np.nan, 1.0), "axis 0, has no noise"),
+        (allan.fit_noise, np.full(100, np.nan), {}, "at least 64 without a gap are needed"),
+        (allan.fit_noise, np.where(np.arange(500) % 50, 1.0, np.nan), {}, "at least 64 without a gap are needed"),
+        (allan.fit_noise, np.where(np.arange(500) == 250, np.nan, 1.0), {}, "axis 0, has no noise"),
+        *((allan.allan_deviation, GAPPY, {"level": level}, "level is ") for level in (0.5, 1.0, np.nan)),
+        (allan.allan_deviation, GAPPY, {"taus": [6.0]}, "must be between"),
     ],
 )
-def test_what_shows_nothing_is_refused(values, words):
+def test_what_shows_nothing_is_refused(call, values, options, words):
     with pytest.raises(InputError, match=words):
-        allan.fit_noise(values, 0.01)
-
-
-@pytest.mark.parametrize("level", [0.5, 1.0, np.nan])
-def test_no_confidence_is_refused(level):
-    with pytest.raises(InputError, match="level is "):
-        allan.allan_deviation(np.append(np.arange(100.0) % 3, np.nan), 1.0, level=level)
-
-
-def test_taus_beyond_half_the_record_are_refused():
-    with pytest.raises(InputError, match="must be between"):
-        allan.allan_deviation(np.append(np.arange(9.0) % 3, np.nan), 1.0, taus=[6.0])
+        call(values, 1.0, **options)

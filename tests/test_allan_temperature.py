@@ -36,14 +36,14 @@ def test_what_is_put_in_comes_out():
 
 
 def test_its_intervals_cover_where_plain_least_squares_would_not():
-    """20 records of a bias that wanders: 95 % intervals hold 19, 16 is 3.1 σ below; those of white residuals hold fewer than half."""
-    samples, runs = 3000, 20
+    """12 records of a bias that wanders: 95 % intervals hold 11.4, 9 is 3.2 σ below; those of white residuals hold fewer than half."""
+    samples, runs = 3000, 12
     T = warm_up(samples)
     x = 1e-3 * (T - T.mean())[:, None] + records(samples, runs, 5)
     fit = allan_temperature.fit_temperature(x, T, DT, order=1)
     inside = np.abs(fit.polynomial.coefficients[1] - 1e-3) <= fit.reach[1]
-    assert 16 <= inside.sum() <= 20
-    assert 0.6 < np.std(fit.polynomial.coefficients[1]) / fit.polynomial.sigma[1].mean() < 1.4  # of 20: ±16 %
+    assert 9 <= inside.sum() <= 12
+    assert 0.5 < np.std(fit.polynomial.coefficients[1]) / fit.polynomial.sigma[1].mean() < 1.5  # of 12: ±20 %
     A = np.stack([np.ones(samples), T - T.mean()], axis=1)
     plain, rest, *_ = np.linalg.lstsq(A, x, rcond=None)
     sigma = np.sqrt(rest / (samples - 2) / np.sum((T - T.mean()) ** 2))
@@ -71,7 +71,7 @@ def three_hours(shape: str, K: float, runs: int):
 @pytest.mark.parametrize(
     ("shape", "K", "runs"),
     [
-        ("line", 3e-7, 25),
+        ("line", 3e-7, 10),
         pytest.param("line", 3e-7, 60, marks=pytest.mark.slow),
         pytest.param("exponential", 3e-6, 60, marks=pytest.mark.slow),
     ],

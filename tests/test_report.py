@@ -311,7 +311,7 @@ def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
     verdicts[0].findings = findings
     after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
     comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
-    tuned = SimpleNamespace(comparison=comparison, measure="likelihood")
+    tuned = SimpleNamespace(comparison=comparison, composite=False)
     answer, reason, details = fitting.verdict(tuned)
     assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
     assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]

@@ -186,7 +186,7 @@ def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many
             )
 
 
-@pytest.mark.parametrize("free", [ALL, ALL[:3], ("filter.scale",)], ids=["eight", "three", "scale"])
+@pytest.mark.parametrize("free", [ALL, ("filter.scale",)], ids=["eight", "scale"])
 def test_the_gradient_is_that_of_the_likelihood(free):
     start = tuning.record_case(every_kind(), KINDS, seed=3)
     objective = tuning.likelihood([start], KINDS, free, parts=5)
@@ -303,12 +303,12 @@ def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
 
 
 @pytest.mark.parametrize("wrong", [30.0, 1.0 / 30.0])
-def test_from_thirty_times_wrong_twenty_starts_find_one_optimum(wrong):
+def test_from_thirty_times_wrong_all_starts_find_one_optimum(wrong):
     simulated_case = case(duration=600.0)
     values = tuning.values_of(BELIEVED, FREE, [simulated_case.record])
     off = tuning.with_values(BELIEVED, {name: wrong * value for name, value in values.items()})
-    fit = tuning.fit(tuning.likelihood([simulated_case], off, FREE), starts=20, intervals=False, threads=2)
-    assert fit.agreeing == 20
+    fit = tuning.fit(tuning.likelihood([simulated_case], off, FREE), starts=8, intervals=False, threads=2)
+    assert fit.agreeing == 8
     assert np.ptp(fit.optima, axis=0).max() < 1e-2
     for parameter in fit.parameters:
         assert abs(np.log(parameter.value / values[parameter.name])) < 4.0 * parameter.standard_error
@@ -353,7 +353,7 @@ def test_white_noise_has_the_closed_form_answer(n):
 def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
     """A bias that is constant: σ_u has no value, only a bound, and the filter gets a moderate one below it."""
     bounds = []
-    for seed in range(6):
+    for seed in range(4):
         objective = tuning.likelihood([case(seed, walk=0.0, duration=300.0)], BELIEVED, FREE)
         fit = tuning.fit(objective, starts=2)
         parameter = fit["gyro.rrw"]
@@ -367,7 +367,7 @@ def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
             assert np.all(np.abs(slope[[0, 2, 3]]) < 0.02 * size[[0, 2, 3]])
             assert fit.setup.process_noise.rate_random_walk == pytest.approx(parameter.value)
         assert fit["gyro.arw"].identified
-    assert len(bounds) >= 4
+    assert len(bounds) >= 2
     assert max(bounds) < 20.0 * RRW
 
 
@@ -385,7 +385,13 @@ def test_a_parameter_that_nothing_depends_on_is_reported_so():
     assert np.isfinite(parameter.value)
 
 
-def test_no_information_is_no_certainty():
+def test_the_sandwich_takes_the_scatter_about_the_mean_and_no_information_is_no_certainty():
+    """Of n parts of a score with covariance C the sum has n C, and C is the scatter over n − 1."""
+    scores = np.array([[1.0, 0.0], [-1.0, 2.0], [3.0, 4.0]])
+    plain, robust = fitting.covariances(np.diag([4.0, 0.25]), scores)
+    inverse = np.diag([0.25, 4.0])
+    np.testing.assert_allclose(plain, inverse, rtol=1e-12)
+    np.testing.assert_allclose(robust, inverse @ (3.0 * np.cov(scores.T, ddof=1)) @ inverse, rtol=1e-12)
     none = np.diag([4.0, 0.0, 1e-14])
     inverse, sandwich = fitting.covariances(none, np.random.default_rng(0).standard_normal((20, 3)))
     assert inverse[0, 0] == pytest.approx(0.25)
@@ -437,24 +443,14 @@ def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     ) == pytest.approx(fit.after, abs=0.02)
 
 
-def test_the_scale_of_a_filter_multiplies_each_of_its_sigmas():
-    filter_setup = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
-    twice = parameters.with_values(filter_setup, {parameters.SCALE: 2.0})
-    assert twice.measurement_sigma_factor == 6.0
-    assert twice.process_noise.angle_random_walk == 2.0 * filter_setup.process_noise.angle_random_walk
-    assert twice.process_noise.rate_random_walk == 2.0 * filter_setup.process_noise.rate_random_walk
-    assert (twice.attitude_sigma, twice.bias_sigma) == (
-        2.0 * filter_setup.attitude_sigma,
-        2.0 * filter_setup.bias_sigma,
-    )
-
-
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
     factor = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
     simulated_case = case()
     assert tuning.values_of(factor, ["star 1.sigma"], [simulated_case.record])["star 1.sigma"] == pytest.approx(3e-4)
-    a = tuning.fit(tuning.likelihood([simulated_case], factor, FREE), starts=1, intervals=False)
-    b = tuning.fit(tuning.likelihood([simulated_case], BELIEVED, FREE), starts=1, intervals=False)
+    a, b = (
+        tuning.fit(tuning.likelihood([simulated_case], start, FREE), starts=1, intervals=False)
+        for start in (factor, BELIEVED)
+    )
     assert a["star 1.sigma"].value == pytest.approx(b["star 1.sigma"].value, rel=1e-3)
     assert a.setup.sigma["star 1"] * 3.0 == pytest.approx(a["star 1.sigma"].value)
 
@@ -503,7 +499,7 @@ def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector(filter_setup):
 
 def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
     """Outliers of ten σ, one in twenty: a filter that uses them all is right with a larger σ, one that refuses them with the sensor's."""
-    cases = [case(seed, outliers=0.05) for seed in range(3)]
+    cases = [case(seed, outliers=0.05) for seed in range(2)]
     values = {}
     for name in ("plain", "gate"):
         objective = tuning.error_objective(cases, AS_IT_RUNS[name], ["star 1.sigma", "star 2.sigma"])
@@ -534,14 +530,11 @@ def test_progress_counts_what_has_ended_in_any_order():
 def test_against_a_truth_wrong_parameters_come_back():
     cases = [case(seed) for seed in range(4)]
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 1.sigma": 3e-5})
-    fit = tuning.fit(
-        tuning.error_objective(cases, off, ["gyro.arw", "star 1.sigma"]), starts=2, factor=3.0, intervals=False
-    )
+    fit = tuning.fit(tuning.error_objective(cases, off, ["gyro.arw", "star 1.sigma"]), starts=1, intervals=False)
     for name, true in (("gyro.arw", ARW), ("star 1.sigma", 1e-4)):
         assert abs(np.log(fit[name].value / true)) < max(4.0 * fit[name].standard_error, 0.2)
         assert fit[name].standard_error < 0.4
-    held = [case(seed) for seed in range(10, 14)]
-    compared = tuning.compare(held, off, fit.setup)
+    compared = tuning.compare([case(seed) for seed in range(10, 14)], off, fit.setup)
     assert abs(compared.after.anees - 1.0) < 0.35
     assert compared.after.attitude_rms < compared.before.attitude_rms
 
@@ -645,7 +638,8 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     simulated_case = case(1, duration=300.0)
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
     compared = tuning.compare([simulated_case], off, BELIEVED)
-    nees = {course.of: course for course in compared.after.nees}
+    course, *others = compared.after.courses
+    nees = {other.of: other for other in others}
     assert set(nees) == {"attitude", "bias"}
     # Spans of even length: their mean, weighted alike, is that of all epochs.
     mean = (np.nanmean(nees["attitude"].mean) + np.nanmean(nees["bias"].mean)) / 2.0
@@ -662,11 +656,11 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert low < 1.0 < high
     by_sensor = [(s.time, s.nis, np.full(len(s.time), s.innovation.shape[1])) for s in estimate.innovations.values()]
     time, nis, degrees = (np.concatenate(part) for part in zip(*by_sensor, strict=True))
-    edges = np.linspace(time.min(), time.max() + 1e-9, len(compared.after.nis_course) + 1)
+    edges = np.linspace(time.min(), time.max() + 1e-9, len(course.mean) + 1)
     sums, numbers = (np.histogram(time, edges, weights=weights)[0] for weights in (nis, degrees))
-    np.testing.assert_allclose(compared.after.nis_course, sums / numbers, rtol=1e-9)
-    np.testing.assert_array_equal(compared.after.nis_degrees, numbers)
-    assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
+    np.testing.assert_allclose(course.mean, sums / numbers, rtol=1e-9)
+    assert course.bounds == consistency.mean_bounds(1, np.median(numbers), 0.99)
+    assert compared.before.courses[2].mean.mean() < 0.5 * nees["bias"].mean.mean()
     figure = drawing.before_and_after(compared, title="both")
     assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == [
         "NIS per degree of freedom\n(log scale)",
@@ -674,21 +668,11 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
         "NEES of the bias",
     ]
     for line, filter_ in zip(figure.axes[0].lines, (compared.before, compared.after), strict=False):
-        np.testing.assert_array_equal(line.get_ydata(), filter_.nis_course[filter_.nis_degrees > 0])
+        np.testing.assert_array_equal(line.get_ydata(), filter_.courses[0].mean)
     bare = dataclasses.replace(simulated_case, record=dataclasses.replace(simulated_case.record, truth=None))
     assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
     beside = dataclasses.replace(bare, true_attitude=simulated_case.record.truth.attitude)
-    assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.nees] == ["attitude"]
-
-
-def test_the_sandwich_takes_the_scatter_of_the_parts_about_their_mean_without_bias():
-    """Of n parts of a score with covariance C the sum has n C, and C is the scatter over n − 1."""
-    scores = np.array([[1.0, 0.0], [-1.0, 2.0], [3.0, 4.0]])
-    information = np.diag([4.0, 0.25])
-    plain, robust = fitting.covariances(information, scores)
-    inverse = np.diag([0.25, 4.0])
-    np.testing.assert_allclose(plain, inverse, rtol=1e-12)
-    np.testing.assert_allclose(robust, inverse @ (3.0 * np.cov(scores.T, ddof=1)) @ inverse, rtol=1e-12)
+    assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.courses] == ["NIS", "attitude"]
 
 
 @pytest.mark.parametrize("mode", [0.01, 0.3, 0.8, 1.2])

@@ -15,6 +15,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
 from strapdown.recordings import recordfiles
+from strapdown.report import tunings
 
 SCENARIO = scenarios.Scenario(
     name="two stars",
@@ -43,6 +44,18 @@ def wrong(tmp_path):
     return path
 
 
+@pytest.fixture
+def scaled(tmp_path):
+    """A record whose gyro has a scale factor, given by its scenario."""
+    scenario = dataclasses.replace(
+        SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.array([0.0, 0.0, 2e-3]))
+    )
+    path = tmp_path / "scaled.h5"
+    record = scenarios.simulate(scenario, 2)
+    recordfiles.write_record(path, record)
+    return path
+
+
 @pytest.mark.draws
 def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, record, wrong):
     out = tmp_path / "results" / "tuned.toml"
@@ -65,14 +78,27 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
         assert (out.parent / name).stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(("flags", "options"), [(("--holdout", 0.3), {"holdout": 0.3}), (("--gate",), {"gate": True})])
-def test_the_command_and_python_give_the_same(succeeds, tmp_path, record, wrong, flags, options):
-    shared = ("--filter", wrong, "--free", "star 1.sigma", "--starts", 1, "--threads", 1)
-    succeeds("tune", record, *shared, *flags, "-o", tmp_path / "tuned.toml")
-    content = json.loads((tmp_path / "tuned.json").read_text())
-    start = setup.read_setup(wrong)
-    tuned = sd.tune(sd.read(record), setup=start, free=["star 1.sigma"], starts=1, threads=1, **options)
-    assert tuned.setup == setup.read_setup(tmp_path / "tuned.toml")
+def test_the_command_and_python_give_the_same_with_a_gate_too(succeeds, tmp_path):
+    """Stars with outliers: the gate is written into the filter, and the report says why."""
+    path, first, out = tmp_path / "struck.h5", tmp_path / "first.toml", tmp_path / "tuned.toml"
+    record = struck_record(SCENARIO, 1)
+    recordfiles.write_record(path, record)
+    first.write_text(setup.to_toml(setup.FilterSetup.for_scenario(SCENARIO, states=False)), encoding="utf-8")
+    free = ["gate.probability", "star 1.sigma", "star 2.sigma"]
+    shared = ("--filter", first, "--free", ",".join(free), "--starts", 1, "--threads", 1, "--holdout", 0.3)
+    said = succeeds("tune", path, *shared, "-o", out)
+    assert "outliers.share" in said
+    assert "is more likely an outlier than noise" in said
+    content = json.loads(out.with_suffix(".json").read_text())
+    tuned = sd.tune(sd.read(path), setup=setup.read_setup(first), free=free, starts=1, threads=1, holdout=0.3)
+    assert tuned.setup == setup.read_setup(out)
+    gate = content["gate"]
+    assert tuned.setup.gate.probability == pytest.approx(gate["probability"])
+    assert gate["lower"] < gate["probability"] < gate["upper"]
+    assert set(gate["thresholds"]) == {"star 1", "star 2"}
+    assert "A measurement with a NIS above" in tunings.report(out.with_suffix(".json"))[0]
+    estimate = setup.run(record, tuned.setup, tuning.record_case(record, tuned.setup, seed=1).initial)
+    assert all(innovation.refused > 5 for innovation in estimate.innovations.values())
     for document in (content, summary := tuned.summary()):
         for tested in document["unmodelled"]:
             tested.pop("record")  # the command names the file
@@ -83,21 +109,24 @@ def test_the_command_and_python_give_the_same(succeeds, tmp_path, record, wrong,
     assert likelihood["name"] == content["parameters"][0]["name"]
     np.testing.assert_allclose(likelihood["values"][12], content["parameters"][0]["value"])
     assert likelihood["fallen"][12] < 3.84
-    assert content == {"records": [record.name], **json.loads(json.dumps(summary))}
+    assert content == {"records": [path.name], **json.loads(json.dumps(summary))}
 
 
-def test_states_are_added_to_a_filter_without_them(succeeds, run, tmp_path):
-    """Its own message advises it: a scale factor of 500 ppm at 3 °/s is no white noise."""
-    spec = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3))
-    path = tmp_path / "scaled.h5"
-    recordfiles.write_record(path, scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec), 1))
-    options = ("--free", "star 1.sigma", "--starts", 1)
-    said = succeeds("tune", path, *options, "-o", tmp_path / "plain.toml")
+def test_states_are_added_to_a_filter_without_them(succeeds, run, tmp_path, scaled):
+    """Its own message advises it: a scale factor of 2000 ppm at 3 °/s is no white noise."""
+    plain, out, shared = tmp_path / "plain.toml", tmp_path / "states.toml", ("--starts", 1, "-o")
+    said = succeeds("tune", scaled, "--free", "star 1.sigma", *shared, plain)
     assert "for which the filter has no state: --states adds states for most errors." in " ".join(said.split())
-    succeeds("tune", path, "--filter", tmp_path / "plain.toml", "--states", *options, "-o", tmp_path / "scaled.toml")
-    assert setup.read_setup(tmp_path / "scaled.toml").states.names == ("gyro.scale",)
-    again = ("--filter", tmp_path / "scaled.toml", "--states")
-    assert "leave --states out" in run("tune", path, *again)[2]
+    free = ("--states", "--free", "gyro.arw,gyro.scale_sigma")
+    for options in (("--filter", plain), ()):
+        said = succeeds("tune", scaled, *options, *free, *shared, out)
+        filter_setup = setup.read_setup(out)
+        assert filter_setup.states.names == ("gyro.scale",)
+        assert filter_setup.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.5)
+        names = [parameter["name"] for parameter in json.loads(out.with_suffix(".json").read_text())["parameters"]]
+        assert names == ["gyro.arw", "gyro.scale_sigma"]
+    assert "Optional states: gyro.scale" in said
+    assert "leave --states out" in run("tune", scaled, "--filter", out, "--states")[2]
 
 
 def test_tune_against_the_truth_and_with_a_prior(succeeds, tmp_path, record, wrong):
@@ -132,33 +161,7 @@ def test_mistakes_are_reported_in_one_line(refusal, tmp_path, record, arguments,
 def test_a_record_that_does_not_specify_its_gyro_needs_a_filter(refusal, tmp_path):
     bare = tmp_path / "bare.h5"
     recordfiles.write_record(bare, dataclasses.replace(scenarios.simulate(SCENARIO, 1), origin=None))
-    said = refusal("tune", bare, "-o", tmp_path / "f.toml")
-    assert "--filter" in said
-
-
-@pytest.fixture
-def scaled(tmp_path):
-    """A record whose gyro has a scale factor, given by its scenario."""
-    scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3)))
-    path = tmp_path / "scaled.h5"
-    record = scenarios.simulate(scenario, 2)
-    recordfiles.write_record(path, record)
-    return path
-
-
-@pytest.mark.parametrize("options", [(), ("--spacing", 2.0)], ids=["likelihood", "spacing"])
-def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled, options):
-    out = tmp_path / "states.toml"
-    status, said, complaint = run(
-        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out, *options
-    )
-    assert status == 0, complaint
-    assert "Optional states: gyro.scale" in said
-    filter_setup = setup.read_setup(out)
-    assert filter_setup.states is not None
-    assert filter_setup.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.5)
-    names = [parameter["name"] for parameter in json.loads(out.with_suffix(".json").read_text())["parameters"]]
-    assert names == ["gyro.arw", "gyro.scale_sigma"]
+    assert "--filter" in refusal("tune", bare, "-o", tmp_path / "f.toml")
 
 
 @pytest.mark.slow
@@ -176,20 +179,22 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, succeed
     assert run(*command)[1].count("--truth tunes the filter with its gate and weights") == 1
 
 
+def struck_record(scenario, seed):
+    """Return a record of the scenario whose sensors have outliers, one in twenty."""
+    faults = vectors.Faults(outlier_probability=0.05, outlier_scale=10.0)
+    sensors = tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario.sensors)
+    return scenarios.simulate(dataclasses.replace(scenario, sensors=sensors), seed)
+
+
 @pytest.mark.slow
 def test_outliers_beside_optional_states(succeeds, tmp_path):
     out = tmp_path / "states.toml"
-    faults = vectors.Faults(outlier_probability=0.1, outlier_scale=10.0)
-    spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.full(3, 2e-3))
-    sensors = tuple(dataclasses.replace(sensor, faults=faults) for sensor in SCENARIO.sensors)
-    struck = scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec, sensors=sensors), 2)
-    recordfiles.write_record(tmp_path / "struck.h5", struck)
+    spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.array([0.0, 0.0, 2e-3]))
+    recordfiles.write_record(tmp_path / "struck.h5", struck_record(dataclasses.replace(SCENARIO, gyro=spec), 2))
     options = ("--states", "--gate", "--free", "star 1.sigma,star 2.sigma", "--starts", 1, "--holdout", 0.3)
-    said = succeeds("tune", tmp_path / "struck.h5", *options, "-o", out)
-    assert "is more likely an outlier than noise" in said
+    succeeds("tune", tmp_path / "struck.h5", *options, "-o", out)
     filter_setup, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())
     assert filter_setup.states is not None
-    assert filter_setup.gate is not None
     assert filter_setup.gate.probability == pytest.approx(content["gate"]["probability"])
     held = content["held_out"]
     assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
@@ -208,17 +213,17 @@ def test_columns_and_topic_are_read_as_estimate_reads_them(run, refusal, tmp_pat
     assert {"--columns": "no accelerometer", "--topic": "topic"}[option] in complaint
 
 
-@pytest.mark.parametrize("options", [("--free", "gyro.arw"), ("--gate",), ("--prior", "bmi088")])
-def test_of_a_recording_without_its_errors_only_the_scale_is_tuned(refusal, tmp_path, options):
+def test_of_a_recording_without_its_errors_only_the_scale_is_tuned(refusal, tmp_path):
     """Its disturbances last: the likelier filter is as a rule worse."""
     path = tmp_path / "walk.csv"
     recording = hand_held.simulated(3, 0, 8.0)
     columns = np.column_stack([recording.time, recording.rate, recording.specific_force, recording.magnetic_field])
     header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
     np.savetxt(path, columns, delimiter=",", header=header, comments="")
-    complaint = refusal("tune", path, "--out", tmp_path / "filter.toml", *options)
-    assert "cannot be tuned by the innovations of a recording" in complaint
-    assert not (tmp_path / "filter.toml").exists()
+    for options in (("--free", "gyro.arw"), ("--gate",), ("--prior", "bmi088")):
+        complaint = refusal("tune", path, "--out", tmp_path / "filter.toml", *options)
+        assert "cannot be tuned by the innovations of a recording" in complaint
+        assert not (tmp_path / "filter.toml").exists()
     with pytest.raises(InputError, match="cannot be tuned by the innovations"):
         sd.tune(recording, free=["gyro.arw"], threads=1)
     tuned = sd.tune(recording, starts=1, threads=1)

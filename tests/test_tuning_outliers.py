@@ -1,7 +1,6 @@
 """Outliers in tuning: the mixture's likelihood against a plain filter of matrices, what it recovers, and the gate that follows."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
-from strapdown.recordings import recordfiles
-from strapdown.report import tunings
 from strapdown.tuning import innovations, outliers
 
 
@@ -285,6 +282,7 @@ def test_five_in_a_hundred_over_60_records():
     assert np.mean([gate.lower <= right <= gate.upper for gate in gates]) >= 0.85
 
 
+@pytest.mark.slow
 def test_outliers_are_found_beside_correlated_noise_that_has_states():
     scenario = correlated(600.0)
     filter_setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=True), attitude_sigma=1e-3)
@@ -337,12 +335,9 @@ def test_at_the_threshold_an_outlier_is_as_likely_as_none():
         assert probability == pytest.approx(chi2.cdf(thresholds["star"][0], degrees), rel=1e-12)
 
 
-@pytest.mark.parametrize("states", [None, pytest.param(States(), marks=pytest.mark.slow)], ids=["lanes", "runs"])
-def test_the_share_of_its_own_noise_in_an_innovation_is_that_of_the_filter(states):
+def test_the_share_of_its_own_noise_in_an_innovation_is_that_of_the_filter():
     case = every_kind()
-    objective = tuning.contaminated_likelihood(
-        [case], dataclasses.replace(KINDS, states=states), ("gyro.arw", "tracker.sigma")
-    )
+    objective = tuning.contaminated_likelihood([case], KINDS, ("gyro.arw", "tracker.sigma"))
     noise = outliers._noise_by_sensor(objective, objective.start[:-2])
     estimate = setup.run(case.record, KINDS, case.initial)
     for series in case.record.vectors:
@@ -377,43 +372,15 @@ def test_the_gate_makes_the_filter_credible_on_data_held_out():
     assert likely > tuning.compare(test, wrong, plain.setup).after.log_likelihood + 0.05
 
 
-def test_so_many_outliers_are_none():
-    objective = tuning.contaminated_likelihood([case(1)], BELIEVED, FREE)
-    fit = tuning.fit(objective, starts=1, intervals=False)
-    many = tuple(
-        dataclasses.replace(parameter, value=0.39, identified=True) if parameter.name == "outliers.share" else parameter
-        for parameter in fit.parameters
-    )
-    assert tuning.tuned_gate(objective, dataclasses.replace(fit, parameters=many)).gate is None
-
-
-def test_a_gate_of_the_setup_keeps_what_else_it_says():
+def test_a_gate_of_the_setup_keeps_what_else_it_says_and_so_many_outliers_are_none():
     filter_setup = dataclasses.replace(BELIEVED, gate=Gate(probability=0.9, recovery=None))
     objective = tuning.contaminated_likelihood([case(1, 300.0)], filter_setup, FREE[2:])
-    gate = tuning.tuned_gate(objective, tuning.fit(objective, starts=1))
+    fit = tuning.fit(objective, starts=1, intervals=False)
+    known = {"identified": True}  # which intervals would say
+    fit = dataclasses.replace(fit, parameters=tuple(dataclasses.replace(p, **known) for p in fit.parameters))
+    gate = tuning.tuned_gate(objective, fit)
     assert gate.gate is not None
     assert gate.gate.recovery is None
     assert gate.gate.probability == gate.probability != 0.9
-
-
-# -------------------------------------------------------------------------------------------------- the command line
-
-
-def test_tune_with_a_gate_writes_it_into_the_filter(succeeds, tmp_path):
-    path, out = tmp_path / "sat.h5", tmp_path / "tuned.toml"
-    recordfiles.write_record(path, scenarios.simulate(scenario(300.0), 1))
-    options = ("--free", "gate.probability,star 1.sigma,star 2.sigma", "--holdout", 0.3, "--starts", 1)
-    said = succeeds("tune", path, *options, "-o", out)
-    assert "outliers.share" in said
-    assert "is more likely an outlier than noise" in said
-    content = json.loads(out.with_suffix(".json").read_text())
-    filter_setup = setup.read_setup(out)
-    assert filter_setup.gate is not None
-    assert filter_setup.gate.probability == pytest.approx(content["gate"]["probability"])
-    assert content["gate"]["lower"] < content["gate"]["probability"] < content["gate"]["upper"]
-    assert set(content["gate"]["thresholds"]) == {"star 1", "star 2"}
-    page, _ = tunings.report(out.with_suffix(".json"))
-    assert "A measurement with a NIS above" in page
-    simulated_case = case(1, 300.0)
-    estimate = setup.run(simulated_case.record, filter_setup, simulated_case.initial)
-    assert all(innovation.refused > 5 for innovation in estimate.innovations.values())
+    many = tuple(dataclasses.replace(p, value=0.39) if p.name == "outliers.share" else p for p in fit.parameters)
+    assert tuning.tuned_gate(objective, dataclasses.replace(fit, parameters=many)).gate is None

@@ -14,6 +14,7 @@ from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 
 ONE = case(duration=20.0)
+ATTITUDE_ALONE = replace(ONE, record=replace(ONE.record, truth=None), true_attitude=ONE.record.truth.attitude)
 SILENT = replace(ONE.record.vectors[0], sigma=np.zeros(1))
 SILENT = replace(ONE.record, vectors=(SILENT, *ONE.record.vectors[1:]))
 COMPASS = replace(
@@ -60,6 +61,7 @@ TABLE = [
     (free, FREE, {"filter_setup": STEADY}, "gyro.rrw starts from 0"),
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
+    (tuning.error_objective, ([ONE, ATTITUDE_ALONE], BELIEVED, FREE), {}, "on records of one kind"),
     (tuning.values_of, (BELIEVED, ["star 1.sigma"], [SILENT]), {}, "sigma is 0"),
     (tuning.Prior, (), {"value": 1.0, "factor": 1.0}, "factor of the prior is 1.0; .* greater than 1"),
     (tuning.fit, (free(*FREE),), {"priors": UNSPECIFIED}, "priors"),

@@ -1,6 +1,7 @@
 """What the tuned filter leaves unexplained: a scale factor that the gyro's noise stands for, gyros of two kinds in one tuning."""
 
 import dataclasses
+import functools
 import json
 
 import numpy as np
@@ -16,7 +17,7 @@ from strapdown.recordings import recordfiles
 from strapdown.records import Origin
 from strapdown.report import tunings
 from strapdown.tuning import residual_checks
-from strapdown.tuning.diagnosis import Cause, turning
+from strapdown.tuning.diagnosis import turning
 
 SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
 
@@ -32,6 +33,7 @@ def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Sc
     )
 
 
+@functools.cache
 def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
     star_scenario = scenario(scale_factor)
     filter_setup = setup.FilterSetup.for_scenario(star_scenario, states=False)
@@ -55,12 +57,17 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
         assert json.dumps(unmodelled.summary())
+        assert size.finding.p_value == pytest.approx(3.0 * chi2.sf(size.gain, 3), rel=1e-9)  # of three levels
     assert doubted >= 1  # where the walk is called identified it is put in doubt
+    # A cause that explains more goes first.
+    cause = dataclasses.replace(size, name="hard iron", of="star 1", gain=size.gain + 1.0)
+    assert not dataclasses.replace(unmodelled, causes=(cause,)).moves_with_the_rate
+    assert dataclasses.replace(unmodelled, causes=(dataclasses.replace(cause, gain=1.0),)).moves_with_the_rate
 
 
 def test_of_right_filters_hardly_one_is_suspected():
     suspected, gains = 0, []
-    for seed in range(10, 14):
+    for seed in range(10, 13):
         case, result = tuned(seed)
         unmodelled = tuning.unmodelled(case, result.setup)
         suspected += unmodelled.suspected
@@ -70,14 +77,6 @@ def test_of_right_filters_hardly_one_is_suspected():
             assert tuning.with_misfit_flag(result, unmodelled) is result
     assert suspected <= 1
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
-
-
-def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
-    case, result = tuned(1, 1e-3)
-    scale_factor = residual_checks.scale_factor(
-        setup.modelled_record(case.record, result.setup), result.setup.process_noise, case.initial
-    )
-    assert scale_factor.finding.p_value == pytest.approx(3.0 * chi2.sf(scale_factor.gain, 3), rel=1e-9)
 
 
 def test_the_turns_are_those_of_the_body_without_its_bias():
@@ -109,7 +108,7 @@ LONG = {
     "gyro": GyroSpec(angle_random_walk=4e-5, rate_random_walk=8e-7),
     "sensors": stars(2e-3, 2e-3),
     "rate": 4.0,
-    "duration": 57000.0,
+    "duration": 30000.0,
 }
 
 
@@ -117,7 +116,7 @@ LONG = {
 def test_noise_explains_nothing(changes, seeds):
     """All that the rate of a body at rest shows is the gyro's noise, and taking off all of it would help; no scale factor is so large.
 
-    Of 16 hours even what is left of it in an average over a few samples would seem a scale factor of several percent.
+    Of eight hours even what is left of it in an average over a few samples would seem a scale factor of several percent.
     """
     changed = dataclasses.replace(scenario(), **changes)
     filter_setup = setup.FilterSetup.for_scenario(changed, states=False)
@@ -156,24 +155,6 @@ def test_what_the_gate_refuses_is_left_out():
     for series, before in zip(left.vectors, case.record.vectors, strict=True):
         assert len(series.time) == len(before.time) - estimate.innovations[series.sensor].refused
         assert 0.02 < estimate.innovations[series.sensor].refused / len(before.time) < 0.06
-
-
-def test_a_cause_that_explains_more_goes_first():
-    case, result = tuned(1, 1e-3)
-    unmodelled = tuning.unmodelled(case, result.setup)
-    assert unmodelled.moves_with_the_rate
-    cause = Cause(
-        name="hard iron",
-        of="star 1",
-        estimate=np.zeros(3),
-        standard_error=np.zeros(3),
-        unit="1",
-        gain=unmodelled.scale_factor.gain + 1.0,
-        log_p=-100.0,
-        words="star 1 has a hard iron",
-    )
-    assert not dataclasses.replace(unmodelled, causes=(cause,)).moves_with_the_rate
-    assert dataclasses.replace(unmodelled, causes=(dataclasses.replace(cause, gain=1.0),)).moves_with_the_rate
 
 
 def test_what_is_held_out_is_left_out():

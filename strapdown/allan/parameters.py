@@ -124,8 +124,8 @@ def to_specification(fit: NoiseFit, source: str) -> str:
 
 
 def commented(lines: list[str]) -> str:
-    """Return lines as TOML comments, without the control characters that a file name may contain."""
-    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)
+    """Return lines as TOML comments."""
+    return "".join(f"# {_plain(line)}\n" for line in lines)
 
 
 def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
@@ -298,5 +298,5 @@ def _both(fits: Mapping[str, NoiseFit], what: str) -> None:
 
 
 def _plain(text: str) -> str:
-    """Return a comment on one line."""
+    """Return a comment on one line, without the control characters that a file name may contain."""
     return "".join(c if c.isprintable() else "?" for c in text)

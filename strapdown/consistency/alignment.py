@@ -45,15 +45,6 @@ class Alignment:
     residual: float
     """RMS of the remaining angle, rad."""
 
-    @property
-    def differences(self) -> str:
-        """Clock shift and rotations found, in one sentence."""
-        fixed, body = (", ".join(f"{x / DEGREE:.3g}" for x in vector) for vector in (self.fixed, self.body))
-        return (
-            f"Aligned by a clock shift of {1e3 * self.offset:.3g} ± {1e3 * self.sigma[6]:.2g} ms and the rotation vectors "
-            f"({fixed})° of the fixed frame and ({body})° of the body frame."
-        )
-
     def summary(self) -> dict[str, Any]:
         """Return the differences as plain values for JSON."""
         return {

@@ -123,16 +123,14 @@ class Finding:
         """Sensor or states, with the epoch if there is one."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
-    def _with_bounds(self, error: float) -> Finding:
-        """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
-        if not (self.is_ratio or self.name == LOG_NEES):
-            return self
+    def _bounds(self, error: float) -> tuple[float, float]:
+        """Return the bounds of the value beyond which the p-value is below ``error``; NaN for a statistic without bounds."""
         within = 1.0 - error / self.epochs
         if self.is_ratio:
-            low, high = mean_bounds(self.degrees, self.samples, within, certainty=self.certainty)
-        else:
-            low, high = log_mean_bounds(self.degrees, int(self.samples), within)
-        return replace(self, low=low, high=high)
+            return mean_bounds(self.degrees, self.samples, within, certainty=self.certainty)
+        if self.name == LOG_NEES:
+            return log_mean_bounds(self.degrees, int(self.samples), within)
+        return math.nan, math.nan
 
 
 INNOVATIONS = "innovations of "
@@ -517,7 +515,9 @@ def concluded(
     marked = holm(findings, 1.0 - confidence_level)
     kept = sum(not finding.rejected for finding in marked)
     # Bounds at the significance level at which Holm's procedure has stopped.
-    marked = [finding._with_bounds((1.0 - confidence_level) / max(kept, 1)) for finding in marked]
+    level = (1.0 - confidence_level) / max(kept, 1)
+    bounds = [finding._bounds(level) for finding in marked]
+    marked = [replace(finding, low=low, high=high) for finding, (low, high) in zip(marked, bounds, strict=True)]
     errors = detectable_errors(marked, confidence_level)
     tested = tuple(Part(of=of, detectable_error=errors.get(of, math.inf), why=why) for of, why in parts.items())
     rejected = [finding for finding in marked if finding.rejected]
@@ -558,14 +558,11 @@ def detectable_errors(findings: Sequence[Finding], confidence_level: float) -> d
     If σ is too small by the factor f, the mean is f² times that of a consistent filter: it exceeds the upper bound with the probability
     that the mean of a consistent filter exceeds that bound divided by f², which is the lower bound.
     """
-    within = (1.0 - confidence_level) / max(len(findings), 1)
     best: dict[str, float] = {}
     for finding in findings:
         if not finding.is_ratio:
             continue
-        low, high = mean_bounds(
-            finding.degrees, finding.samples, 1.0 - within / finding.epochs, certainty=finding.certainty
-        )
+        low, high = finding._bounds((1.0 - confidence_level) / len(findings))
         of = f"{INNOVATIONS}{finding.of}" if finding.name == "NIS" else finding.of
         best[of] = min(best.get(of, math.inf), math.sqrt(high / low) if low > 0.0 else math.inf)
     return best

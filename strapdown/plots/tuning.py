@@ -95,12 +95,12 @@ def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
     both = (("before", comparison.before, style.VERMILION), ("after", comparison.after, style.BLUE))
     rows = len(comparison.after.courses)
     figure, axes = style.new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
-    for number, (of, _, _, bounds) in enumerate(comparison.after.courses):
-        courses = []
+    for number, course in enumerate(comparison.after.courses):
+        drawn = []
         for name, performance, color in both:
-            _, time, mean, _ = performance.courses[number]
-            courses.append((name, color, float(np.nanmean(mean)) if number else performance.nis, time, mean))
-        _course(axes[number, 0], courses, bounds, of)
+            own = performance.courses[number]
+            drawn.append((name, color, float(np.nanmean(own.mean)) if number else performance.nis, own.time, own.mean))
+        _course(axes[number, 0], drawn, course.bounds, course.label)
     figure.suptitle(title)
     axes[-1, 0].set_xlabel("time, s")
     return figure

@@ -24,7 +24,7 @@ tune only ``filter.scale``, which scales the σ and leaves the estimates unchang
 
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Slices, Tuning, fit, search, slices
-from strapdown.tuning.initialization import by_innovations, one_gyro, record_case, recording_case, recording_setup
+from strapdown.tuning.initialization import by_innovations, one_gyro, record_case, recording_case
 from strapdown.tuning.innovations import likelihood
 from strapdown.tuning.objective import Case
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate

@@ -18,7 +18,7 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import Likelihood, construct, with_engine
+from strapdown.tuning.innovations import Likelihood, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, make_problem
 
 MAX_EPOCHS = 1000
@@ -84,7 +84,11 @@ def error_objective(
     problem = make_problem(cases, filter_setup, free, threads=threads)
     base = with_engine(problem)
     references = tuple(_spread(base, number) for number in range(len(base.cases)))
-    return construct(ErrorObjective, problem, base=base, references=references)
+    if len({known.bias is None for known in references}) > 1:
+        raise InputError(
+            "some records have a true bias, others a reference attitude alone; tune on records of one kind"
+        )
+    return ErrorObjective(**vars(problem), base=base, references=references)
 
 
 class Reference(NamedTuple):

@@ -211,10 +211,6 @@ class Tuning(Listed):
         Number of searches that ended within 0.001 of the best log likelihood.
     objective : Objective
         Function that was minimised, for :func:`slices` of it.
-    composite : bool, default False
-        Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich).
-    measure : str, default "likelihood"
-        What was maximised: "likelihood" or "likelihood of the errors".
     gate : TunedGate, optional
         The gate, if outliers were modelled.
     comparison : Comparison, optional
@@ -236,12 +232,15 @@ class Tuning(Listed):
     misfit: bool
     agreeing: int
     objective: Objective
-    composite: bool = False
-    measure: str = "likelihood"
     gate: TunedGate | None = None
     comparison: Comparison | None = None
     unmodelled: tuple[Unmodelled, ...] = ()
     remarks: tuple[str, ...] = ()
+
+    @property
+    def composite(self) -> bool:
+        """Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich)."""
+        return self.objective.composite
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.
@@ -252,6 +251,7 @@ class Tuning(Listed):
             Parameters with their intervals, objective, searches, errors not modelled, gate, and performance on held-out data; as text for
             a report the verdict, tables and words.
         """
+        measure = "likelihood of the errors" if self.composite else "likelihood"
         content: dict[str, Any] = {
             "parameters": [
                 {
@@ -263,7 +263,7 @@ class Tuning(Listed):
                 for parameter in self.parameters
             ],
             "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
-            "objective": {"name": self.measure, "before": self.before, "after": self.after},
+            "objective": {"name": measure, "before": self.before, "after": self.after},
             "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
             "innovations_fit": not self.misfit,
             "unmodelled": [check.summary() for check in self.unmodelled],
@@ -353,7 +353,7 @@ def verdict(tuning: Tuning) -> tuple[str, str, list[str]]:
         return "cannot tell", "the held-out data were not judged", []
     worst = max(after, key=lambda judgement: VERDICTS.index(judgement.verdict))
     details = [finding.means for judgement in after for finding in judgement.findings if finding.rejected]
-    if not comparison.better and tuning.measure == "likelihood":
+    if not comparison.better and not tuning.composite:
         details.append("on the held-out data the likelihood has decreased: keep the previous filter")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
         details.append("on the held-out data the attitude error has increased: keep the previous filter")
@@ -451,8 +451,7 @@ def fit(
         before=local_at(objective, objective.start, known).value,
         after=best.local.value,
         covariance=errors.covariance,
-        misfit=errors.misfit and not objective.composite,
-        composite=objective.composite,
+        misfit=errors.misfit,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
@@ -471,7 +470,6 @@ def _estimated(
 ) -> Estimated:
     """Return parameter j with its interval; ``point`` has the values used in the filter."""
     name, error = objective.names[j], float(errors.standard[j])
-    doubtful = errors.misfit and not objective.composite
     return Estimated(
         name=name,
         start=float(np.exp(objective.start[j])),
@@ -481,7 +479,7 @@ def _estimated(
         upper=interval.upper,
         standard_error=error,
         identified=interval.identified,
-        note=_note(name, interval, error, best.local, j, priors, doubtful=doubtful),
+        note=_note(name, interval, error, best.local, j, priors, doubtful=errors.misfit),
         unit=objective.unit(name),
     )
 
@@ -545,17 +543,18 @@ class _Errors(NamedTuple):
 def _errors(objective: Objective, best: Optimum) -> _Errors:
     """Return the errors of the best point: by the information, or by the sandwich for a misfit or a composite objective."""
     local, information = best.local, best.local.information
-    if objective.curvature is not None:  # the curvature with that of the priors, if positive definite
-        own = objective.curvature(best.point) + information - local.derivatives.information
+    curvature = objective.curvature(best.point)
+    if curvature is not None:  # with that of the priors, if positive definite
+        own = curvature + information - local.derivatives.information
         information = own if np.linalg.eigvalsh(own)[0] > 0.0 else information
     covariance, robust = covariances(information, local.derivatives.score)
-    curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
-    misfit = bool(np.any(sandwich > MISFIT * curvature))
+    standard, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    misfit = not objective.composite and bool(np.any(sandwich > MISFIT * standard))
     # A likelihood whose standard errors are too small by a factor falls too fast by its square.
     swollen = np.ones(len(best.point))
     if misfit or objective.composite:
-        swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
-    return _Errors(covariance, swollen * curvature, swollen, misfit)
+        swollen = np.maximum(sandwich / standard, 0.0 if objective.composite else 1.0)
+    return _Errors(covariance, swollen * standard, swollen, misfit)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,11 +19,6 @@ from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import SCALE
 
 
-def recording_setup() -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs."""
-    return AhrsParameters().setup
-
-
 def recording_case(recording: Recording) -> Case:
     """Return a recording as filtered by :func:`strapdown.ahrs.estimate`: with its reference.
 

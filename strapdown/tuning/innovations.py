@@ -10,10 +10,10 @@ best.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -120,13 +120,10 @@ class Likelihood(Objective):
             information=(lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0),
         )
 
-    @property
-    def curvature(self) -> Callable[[Array], Array] | None:
-        """The observed information at a point, with error states, of which one record has few draws."""
-        return None if self.filter_setup.states is None else self._curvature
-
-    def _curvature(self, point: Array) -> Array:
-        """Return the second derivatives of minus the log likelihood at a point (p, p)."""
+    def curvature(self, point: Array) -> Array | None:
+        """Return the observed information at a point (p, p), with error states, of which one record has few draws."""
+        if self.filter_setup.states is None:
+            return None
         steps = CURVATURE_STEP * np.eye(len(point))
         ends = [[self.derivatives(point + sign * step).score.sum(axis=0) for sign in (1.0, -1.0)] for step in steps]
         rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
@@ -313,14 +310,6 @@ def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
     return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
 
 
-Made = TypeVar("Made", bound=Objective)
-
-
-def construct(kind: type[Made], problem: Objective, **more: Any) -> Made:
-    """Return an objective of this class for a problem."""
-    return kind(**{field.name: getattr(problem, field.name) for field in fields(Objective)} | more)
-
-
 def likelihood(
     cases: Sequence[Case],
     filter_setup: FilterSetup,
@@ -360,7 +349,7 @@ def likelihood(
 
 def with_engine(problem: Objective) -> Likelihood:
     """Return the likelihood of a problem."""
-    return construct(Likelihood, problem, prepared=tuple(_prepared(problem, case) for case in problem.cases))
+    return Likelihood(**vars(problem), prepared=tuple(_prepared(problem, case) for case in problem.cases))
 
 
 def _filter(problem: Objective, case: Case, events: Schedule, filter_setup: FilterSetup) -> tuple[Model, State]:

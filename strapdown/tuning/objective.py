@@ -139,9 +139,8 @@ class Objective:
     composite: ClassVar[bool] = False
     """Whether its curvature is not an information matrix, so standard errors are from the scatter of its gradient."""
 
-    @property
-    def curvature(self) -> Callable[[Array], Array] | None:
-        """Second derivatives at a point (p, p), if the information of the search is not accurate enough for standard errors."""
+    def curvature(self, point: Array) -> Array | None:
+        """Return second derivatives at a point (p, p) if the information of the search is not accurate enough for standard errors."""
         return None
 
     @property

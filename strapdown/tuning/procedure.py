@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
@@ -14,43 +14,10 @@ from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
 from strapdown.tuning.residual_checks import examined, with_misfit_flag
-from strapdown.tuning.validation import Comparison, compare
+from strapdown.tuning.validation import compare
 
 GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
-
-
-def objective_for(
-    cases: Sequence[Case],
-    setup: FilterSetup,
-    names: Sequence[str],
-    *,
-    truth: bool = False,
-    gate: bool = False,
-    spacing: float = 0.0,
-    threads: int = 1,
-) -> Objective:
-    """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
-
-    ``truth``: likelihood of the errors against the truth, of the filter as used, including its gate. Innovations are those of the filter
-    without its gate, because the likelihood of accepted ones increases as the gate becomes narrower; ``gate``: model outliers. ``spacing``:
-    minimum time between the samples of a sensor that are used, s.
-    """
-    if spacing > 0.0 and truth:
-        raise InputError(
-            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
-        )
-    if gate and (truth or spacing > 0.0):
-        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
-    if truth:
-        return error_objective(cases, setup, names, threads=threads)
-    objective = (
-        contaminated_likelihood(cases, setup, names, threads=threads)
-        if gate
-        else likelihood(cases, setup, names, spacing=spacing, threads=threads)
-    )
-    # If eight points run at once, the threads run searches, otherwise records and points.
-    return dataclasses.replace(objective, threads=1) if isinstance(objective, Likelihood) else objective
 
 
 def tune(
@@ -80,13 +47,16 @@ def tune(
     names : sequence of str, optional
         Parameters to tune; those of :data:`GATED` imply ``gate``. Default: :func:`default_names`.
     priors, starts, factor, seed, threads, progress : optional
-        As for :func:`fit`; the threads process records if there is one search at a time.
+        As for :func:`fit`; against a truth the threads process records if there are several.
     gate : bool, default False
         Model outliers, and set the gate where an outlier is more likely.
     held : sequence of Case, optional
         Held-out data (:func:`split`), on which the filter before and after tuning are compared.
-    truth, spacing : optional
-        As for :func:`objective_for`.
+    truth : bool, default False
+        Maximise the likelihood of the errors against the truth, of the filter as used, including its gate. Default: that of the innovations
+        of the filter without its gate, because the likelihood of accepted ones increases as the gate becomes narrower.
+    spacing : float, default 0
+        Minimum time between the measurements of a sensor that are used, s.
 
     Returns
     -------
@@ -100,40 +70,39 @@ def tune(
     """
     gate = gate or any(name in GATED for name in names or ())
     wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
-    objective = objective_for(cases, setup, wanted, truth=truth, gate=gate, spacing=spacing, threads=threads)
+    if spacing > 0.0 and truth:
+        raise InputError(
+            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
+        )
+    if gate and (truth or spacing > 0.0):
+        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
+    objective: Objective
+    if truth:
+        objective = error_objective(cases, setup, wanted, threads=threads)
+    elif gate:
+        objective = contaminated_likelihood(cases, setup, wanted)
+    else:
+        objective = likelihood(cases, setup, wanted, spacing=spacing)
     result = fit(
         objective,
         priors=priors,
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(objective, Likelihood) or (objective.composite and len(cases) == 1) else 1,
+        threads=1 if truth and len(cases) > 1 else threads,  # searches, unless records are evaluated in parallel
         progress=progress,
     )
-    gated = tuned_gate(objective, result) if isinstance(objective, Likelihood) and objective.mixed else None
-    if gated is not None and gated.gate is not None:
-        result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=gated.gate))
-    result = dataclasses.replace(result, gate=gated, comparison=_compared(held, setup, result, objective, threads))
-    result = dataclasses.replace(result, measure="likelihood" + " of the errors" * truth)
-    return _examined(cases, setup, result)
-
-
-def _compared(
-    held: Sequence[Case], before: FilterSetup, result: Tuning, objective: Objective, threads: int
-) -> Comparison | None:
-    """Return the filter before and after on held-out data; None if there are none."""
-    if not held:
-        return None
-    comparison = compare(held, before, result.setup, threads=threads)
-    if isinstance(objective, Likelihood) and objective.mixed:  # the likelihood after tuning includes the gate
-        likely = log_likelihood(held, objective, result)
-        comparison = dataclasses.replace(comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely))
-    return comparison
-
-
-def _examined(cases: Sequence[Case], before: FilterSetup, result: Tuning) -> Tuning:
-    """Return the tuning with tests for errors that it does not model."""
-    tested = examined(cases, before, result)
-    for check in sorted(tested, key=lambda check: check.severity)[-1:]:
-        result = with_misfit_flag(result, check)
-    return dataclasses.replace(result, unmodelled=tested)
+    if isinstance(objective, Likelihood) and gate:
+        gated = tuned_gate(objective, result)
+        tuned = result.setup if gated.gate is None else replace(result.setup, gate=gated.gate)
+        result = replace(result, gate=gated, setup=tuned)
+    if held:
+        comparison = compare(held, setup, result.setup, threads=threads)
+        if isinstance(objective, Likelihood) and gate:  # the likelihood after tuning includes the gate
+            likely = log_likelihood(held, objective, result)
+            comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+        result = replace(result, comparison=comparison)
+    tested = examined(cases, setup, result)
+    if tested:
+        result = with_misfit_flag(result, max(tested, key=lambda check: check.severity))
+    return replace(result, unmodelled=tested)

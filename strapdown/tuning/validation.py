@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -54,22 +54,22 @@ def split(cases: Sequence[Case], share: float) -> tuple[tuple[Case, ...], tuple[
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NeesCourse:
-    """NEES of a subset of the states over the time of a record."""
+class Course:
+    """NIS, or NEES of some states, over the time of a record."""
 
     of: str
-    """"attitude" or "bias"."""
+    """"NIS", or the states of the NEES: "attitude" or "bias"."""
     time: Array
     """Midpoints of the time bins (k,), s."""
     mean: Array
-    """Mean NEES per state in each bin (k,); NaN without a truth."""
-    effective: float
-    """Effective number of independent errors per bin; errors of one run are correlated."""
+    """Mean per degree of freedom in each bin (k,), 1 for a consistent filter; NaN without measurements or truth."""
+    bounds: tuple[float, float]
+    """Two-sided 99 % bounds of the mean in one bin for a consistent filter."""
 
     @property
-    def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of the mean in each bin for a consistent filter."""
-        return mean_bounds(3, max(self.effective, 1.0), 0.99)
+    def label(self) -> str:
+        """What is averaged, in words."""
+        return "NIS per degree of freedom" if self.of == "NIS" else f"NEES of the {self.of}, per state"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,33 +88,16 @@ class Performance:
     """RMS of the attitude error (all axes together), rad; NaN without a truth."""
     judgements: tuple[Judgement, ...]
     """The verdict on each record."""
-    nis_time: Array
-    """Midpoints of the time bins of the first record (k,), s."""
-    nis_course: Array
-    """Mean NIS per degree of freedom in each bin (k,)."""
-    nis_degrees: Array
-    """Degrees of freedom in each bin (k,)."""
-    nees: tuple[NeesCourse, ...] = ()
-    """NEES over the time of the first record, of attitude and bias if their truth is known."""
-
-    @property
-    def courses(self) -> list[tuple[str, Array, Array, tuple[float, float]]]:
-        """What is shown over the time of the first record: name, times, means, 99 % bounds of each."""
-        known = self.nis_degrees > 0
-        typical = max(1, round(float(np.median(self.nis_degrees[known]))))
-        nis = np.where(known, self.nis_course, np.nan)
-        courses = [("NIS per degree of freedom", self.nis_time, nis, mean_bounds(1, typical, 0.99))]
-        return courses + [
-            (f"NEES of the {course.of}, per state", course.time, course.mean, course.bounds) for course in self.nees
-        ]
+    courses: tuple[Course, ...]
+    """NIS over the time of the first record, and NEES of attitude and bias if their truth is known."""
 
     @property
     def row(self) -> tuple[Any, ...]:
         """Row of the table :meth:`Comparison.listing`."""
         verdicts = [judgement.verdict for judgement in self.judgements]
         anees = figure(self.anees, 3)
-        if self.nees and not np.isfinite(self.anees):  # the reference has no bias
-            anees = f"{figure(float(np.nanmean(self.nees[0].mean)), 3)} (attitude)"
+        if self.courses[1:] and not np.isfinite(self.anees):  # the reference has no bias
+            anees = f"{figure(float(np.nanmean(self.courses[1].mean)), 3)} (attitude)"
         return (
             self.log_likelihood,
             self.nis,
@@ -166,10 +149,10 @@ class Comparison(Listed):
                 "nis_bounds": performance.nis_bounds,
                 "anees_per_state": performance.anees,
                 "attitude_rms_rad": performance.attitude_rms,
-                "nees_per_state": {course.of: np.nanmean(course.mean) for course in performance.nees},
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in performance.courses[1:]},
                 "over_time": [
-                    {"of": of, "time_s": time, "mean": mean, "bounds": bounds}
-                    for of, time, mean, bounds in performance.courses
+                    {"of": course.label, "time_s": course.time, "mean": course.mean, "bounds": course.bounds}
+                    for course in performance.courses
                 ],
                 "judgements": [judgement.summary() for judgement in performance.judgements],
             }
@@ -225,7 +208,6 @@ def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance
         elif truth is not None:
             errors = consistency.reference_errors(estimate.attitude, truth.attitude).total
             error_squares.append(errors[np.isfinite(errors)] ** 2)
-    time, course, degrees = _nis_course(list(judged[0][0].innovations.values()))
     return Performance(
         log_likelihood=total / number,
         nis=squares / number,
@@ -236,10 +218,7 @@ def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance
             consistency.judge(estimate, truth if truth is not None and _knows_bias(truth) else None)
             for estimate, truth in judged
         ),
-        nis_time=time,
-        nis_course=course,
-        nis_degrees=degrees,
-        nees=_nees_courses(*judged[0]),
+        courses=(_nis_course(judged[0][0].innovations.values()), *_nees_courses(*judged[0])),
     )
 
 
@@ -281,19 +260,21 @@ def _spans(time: Array, first: float, last: float) -> tuple[Array, np.ndarray]:
     return 0.5 * (edges[1:] + edges[:-1]), place
 
 
-def _nis_course(innovations: Sequence[Innovations]) -> tuple[Array, Array, Array]:
-    time = np.concatenate([innovation.time[innovation.used] for innovation in innovations])
-    middles, places = _spans(time, time.min(), time.max())
-    sums, degrees = np.zeros(BINS), np.zeros(BINS)
-    for part in innovations:
-        place, places = places[: part.used.sum()], places[part.used.sum() :]
-        sums += np.bincount(place, part.nis[part.used], BINS)
-        degrees += np.bincount(place, minlength=BINS) * float(part.innovation.shape[1])
+def _nis_course(innovations: Iterable[Innovations]) -> Course:
+    parts = [(part.time[part.used], part.nis[part.used], part.innovation.shape[1]) for part in innovations]
+    time, nis, degrees = (
+        np.concatenate(column)
+        for column in zip(*((time, nis, np.full(len(time), float(rows))) for time, nis, rows in parts), strict=True)
+    )
+    middles, place = _spans(time, time.min(), time.max())
+    in_bins = np.bincount(place, degrees, BINS)
+    typical = max(1, round(float(np.median(in_bins[in_bins > 0]))))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return middles, sums / degrees, degrees
+        mean = np.bincount(place, nis, BINS) / in_bins
+    return Course(of="NIS", time=middles, mean=mean, bounds=mean_bounds(1, typical, 0.99))
 
 
-def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[NeesCourse, ...]:
+def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[Course, ...]:
     known = None if truth is None else np.isfinite(truth.attitude).all(axis=1)
     if truth is None or known is None or int(known.sum()) < MIN_ERRORS:
         return ()
@@ -315,5 +296,7 @@ def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[NeesCourse, 
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(place, consistency.nees(error, P, states), BINS) / (len(states) * number)
-        courses.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / BINS))
+        # Errors of one run are correlated: of those in a bin fewer are independent.
+        bounds = mean_bounds(3, max(average.effective / BINS, 1.0), 0.99)
+        courses.append(Course(of=name, time=middles, mean=mean, bounds=bounds))
     return tuple(courses)

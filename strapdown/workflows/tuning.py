@@ -110,7 +110,7 @@ def tune(
             need_angles(setup, source)
             cases.append(tuning.record_case(source, setup, name=label))
         else:
-            setup = setup or tuning.recording_setup()
+            setup = setup or ahrs.AhrsParameters().setup
             cases.append(tuning.recording_case(source))
     assert setup is not None
     if own and (setup.gate or setup.robust) and not (truth or gate):

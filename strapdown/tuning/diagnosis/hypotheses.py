@@ -84,6 +84,27 @@ def _time_offset(of: str, sensors: tuple[str, ...], interval: float) -> Hypothes
     )
 
 
+def _of_series(
+    sensor: str,
+    name: str,
+    unit: str,
+    size: int,
+    limit: float,
+    change: Callable[[VectorMeasurements, Array], VectorMeasurements],
+    words: Callable[[Array, Array], str],
+) -> Hypothesis:
+    """Return the hypothesis of a change of one sensor's series, with θ of this size."""
+    return Hypothesis(
+        name=name,
+        of=sensor,
+        unit=unit,
+        steps=np.full(size, 1e-5),
+        limit=limit,
+        apply=lambda model, theta: model.with_series(sensor, lambda series: change(series, theta)),
+        words=words,
+    )
+
+
 def _body_fixed(series: VectorMeasurements) -> Hypothesis:
     magnetic = "mag" in series.sensor.lower()
 
@@ -96,57 +117,38 @@ def _body_fixed(series: VectorMeasurements) -> Hypothesis:
         moved = replace(old, vector_b=(old.vector_b - theta) / length)
         return moved.noise_scaled(float(np.nanmean(1.0 / length)))
 
+    def words(theta: Array, _: Array) -> str:
+        what = "a hard iron" if magnetic else "a constant error in body axes"
+        return f"{series.sensor} has {what} of {shown(theta)} times its reference"
+
     name = "hard iron" if magnetic else "body-fixed bias"
-    return Hypothesis(
-        name=name,
-        of=series.sensor,
-        unit="1 (length of the reference)",
-        steps=np.full(3, 1e-5),
-        limit=0.5,
-        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
-        words=lambda theta, _: (
-            f"{series.sensor} has {'a hard iron' if magnetic else 'a constant error in body axes'} of {shown(theta)} times its reference"
-        ),
-    )
+    return _of_series(series.sensor, name, "1 (length of the reference)", 3, 0.5, change, words)
 
 
 def _mounting(series: VectorMeasurements) -> Hypothesis:
     def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
         turn = quaternion.exp(theta)
         if old.attitude is not None:
-            return replace(
-                old,
-                attitude=quaternion.normalize(quaternion.multiply(old.attitude, quaternion.conjugate(turn))),
-            )
+            turned = quaternion.multiply(old.attitude, quaternion.conjugate(turn))
+            return replace(old, attitude=quaternion.normalize(turned))
         return replace(old, vector_b=old.vector_b @ quaternion.to_matrix(turn).T)  # keeps rows of NaN
 
-    return Hypothesis(
-        name="mounting",
-        of=series.sensor,
-        unit="rad",
-        steps=np.full(3, 1e-5),
-        limit=0.35,
-        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
-        words=lambda theta, _: f"{series.sensor} has a mounting error of {shown(theta, 1e3)} mrad in the body",
-    )
+    def words(theta: Array, _: Array) -> str:
+        return f"{series.sensor} has a mounting error of {shown(theta, 1e3)} mrad in the body"
+
+    return _of_series(series.sensor, "mounting", "rad", 3, 0.35, change, words)
 
 
 def _reference_length(series: VectorMeasurements) -> Hypothesis:
-    def apply(model: Model, theta: Array) -> Model:
-        return model.with_series(series.sensor, lambda s: replace(s, reference_f=s.reference_f / (1.0 + theta[0])))
+    def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
+        return replace(old, reference_f=old.reference_f / (1.0 + theta[0]))
 
-    return Hypothesis(
-        name="reference length",
-        of=series.sensor,
-        unit="1",
-        steps=np.array([1e-5]),
-        limit=0.5,
-        apply=apply,
-        words=lambda theta, spread: (
-            f"the reference of {series.sensor} is {100.0 * abs(theta[0]):.3g} ± {100.0 * spread[0]:.2g} % too "
-            f"{'long' if theta[0] > 0.0 else 'short'}, or its scale factor too {'small' if theta[0] > 0.0 else 'large'} by as much"
-        ),
-    )
+    def words(theta: Array, spread: Array) -> str:
+        off, scale = ("long", "small") if theta[0] > 0.0 else ("short", "large")
+        size = f"{100.0 * abs(theta[0]):.3g} ± {100.0 * spread[0]:.2g} %"
+        return f"the reference of {series.sensor} is {size} too {off}, or its scale factor too {scale} by as much"
+
+    return _of_series(series.sensor, "reference length", "1", 1, 0.5, change, words)
 
 
 def _reference_direction(series: VectorMeasurements) -> Hypothesis:
@@ -158,17 +160,10 @@ def _reference_direction(series: VectorMeasurements) -> Hypothesis:
             back = quaternion.exp(-theta * np.array([0.0, 0.0, 1.0]))
         return replace(old, reference_f=quaternion.rotate(back, old.reference_f))
 
-    return Hypothesis(
-        name="reference direction",
-        of=series.sensor,
-        unit="rad",
-        steps=np.full(3, 1e-5),
-        limit=0.35,
-        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
-        words=lambda theta, _: (
-            f"the reference of {series.sensor} is rotated by {shown(theta, 1e3)} mrad in the fixed frame"
-        ),
-    )
+    def words(theta: Array, _: Array) -> str:
+        return f"the reference of {series.sensor} is rotated by {shown(theta, 1e3)} mrad in the fixed frame"
+
+    return _of_series(series.sensor, "reference direction", "rad", 3, 0.35, change, words)
 
 
 def _off_diagonal(theta: Array) -> Array:
