@@ -226,7 +226,7 @@ def test_its_campaign_goes_on_and_is_replayed_where_the_code_is_given_again(fold
 
 def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_and_judged(folder, capsys):
     command("scene.toml", "--filter", "mine.py:alone", "--runs", 3, "--out", "own.h5", "--replay", 1)
-    assert "(three states)" in capsys.readouterr().out
+    assert "maximum NEES of the states" in capsys.readouterr().out
     files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
     cli.app(["check", *files], standalone_mode=False)
     assert "cannot tell: attitude not testable from this run: too few epochs with a truth" in capsys.readouterr().out

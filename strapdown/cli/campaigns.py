@@ -157,7 +157,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
     ui.check_files(*paths)
     again = sd.montecarlo.replay(plan, run, machine=machine)
-    sd.write(again.record, paths[0], attributes=again.estimate.details)
+    sd.write(again.record, paths[0])
     sd.write(again.estimate, paths[1])
     nees, worst = again.largest_nees(plan.time)
     ui.say(

@@ -11,7 +11,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
-from strapdown.cli.options import FILTER, FORMAT, Format, Layout
+from strapdown.cli.options import FILTER, FORMAT, STATES, Format, Layout
 from strapdown.files import write_json
 
 
@@ -25,7 +25,7 @@ class _Filter:
         "initial.bias, gate.probability; or only filter.scale, as for a recording without --truth. Default: gyro and every sensor.",
     )
     filter_file: Path | None = FILTER
-    states: bool = Option(False, "--states", help="A state for each specified error; --free may name its parameters.")
+    states: bool | None = STATES
     prior: str | None = Option(None, help="Weak prior of the gyro noise: TOML of `strapdown allan`, or a preset.")
 
     @property
