@@ -171,6 +171,8 @@ def test_specific_force_at_a_lever_arm_is_the_second_derivative_of_the_position(
     wanted = rotation(body, time).inv().apply(moved + pushed(time) - np.array(vectors.GRAVITY_F))
     got = vectors.specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
     np.testing.assert_allclose(got, wanted, atol=2e-8)
+    at_rest = rotation(body, time).inv().apply(-np.array(vectors.GRAVITY_F))
+    np.testing.assert_allclose(vectors.specific_force(body, time), at_rest, atol=1e-12)  # of the centre of rotation
 
 
 def test_an_accelerometer_off_the_centre_errs_by_the_acceleration():
