@@ -375,9 +375,7 @@ def iron_step(constants, field, frame, known, time, strength, memory):
     memory.ring_time[r] = time
     for i in range(9):
         sums[i] += constants.iron_share * (equations[i] - sums[i])
-    iron = iron_of(
-        constants, (sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]), strength
-    )
+    iron = iron_of(constants, sums, strength)
     for i in range(3):
         memory.iron[i] += constants.rise_share * (iron[i] - memory.iron[i])
     iron = (memory.iron[0], memory.iron[1], memory.iron[2])
