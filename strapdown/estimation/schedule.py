@@ -107,7 +107,7 @@ class Schedule:
     def _ordered(self, column: Array) -> Array:
         return column if len(self.sensors) < 2 else np.take(column, self.row, axis=0)
 
-    @property
+    @cached_property
     def measurements(self) -> measurement.Measurements:
         """Measurements as the kernels' argument."""
         value, sigma = _joined(self.series_vector_b, (0, 3)).reshape(-1), _joined(self.series_sigma, (0,))
