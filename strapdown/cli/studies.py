@@ -60,13 +60,13 @@ def covariance(
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
     from strapdown.estimation import setup
-    from strapdown.workflows.filters import considered, filter_for_scenario, state_words
+    from strapdown.workflows.filters import filter_for_scenario, state_words
 
     body, name = sd.scenarios.load_scenario(scenario), Path(scenario).stem
     ui.check_files(out / "covariance.json", out / f"budget.{form}")
     named = by_name("--consider", consider or [], "NAME=VALUE, such as scale_factor=300")
     sizes = {name: numbers(f"--consider {name}", text, "a number", 1)[0] for name, text in named.items()}
-    errors = considered(sizes, body.sensors)
+    errors = sd.covariance.consider.considered(sizes, body.sensors)
     from_file = None if filter_file is None else setup.read_setup(filter_file)
     filter_setup = filter_for_scenario(body, setup=from_file, states=states)
     with ui.progress_bar("covariance analysis"):

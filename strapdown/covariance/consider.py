@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from strapdown import vectors
-from strapdown.checks import InputError, known_keys, non_negative
+from strapdown.checks import InputError, known_keys, non_negative, one_of
 from strapdown.results import ByValue
 from strapdown.scenarios import Scenario
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 LARGEST_SIZE = 1e12
 """Maximum considered or initial error, in the units of :class:`Consider`; keeps its square in the range of doubles."""
@@ -79,3 +81,28 @@ def check_considered(scenario: Scenario, consider: Consider) -> None:
                 f"consider: time_offset of {name} is {offset:g} s, and the scenario lasts {scenario.duration:g} s; "
                 "give an offset shorter than the scenario, in seconds"
             )
+
+
+def considered(sizes: Mapping[str, float], sensors: Sequence[Any]) -> dict[str, Any]:
+    """Return 1σ of errors by name, in the units of a data sheet, as arguments of :func:`strapdown.covariance_analysis`.
+
+    scale_factor in ppm, misalignment in mrad, g_sensitivity in °/h/g; SENSOR.bias in nT, m/s² or arcsec by its kind, SENSOR.mounting in
+    arcsec, SENSOR.delay in ms; initial.attitude in °, initial.bias in °/h.
+    """
+    units_of = {"scale_factor": 1e-6, "misalignment": 1e-3, "g_sensitivity": DEGREE_PER_HOUR / STANDARD_GRAVITY}
+    units_of |= {"initial.attitude": DEGREE, "initial.bias": DEGREE_PER_HOUR}
+    fields = {"bias": "sensor_bias", "mounting": "mounting", "delay": "time_offset"}
+    for sensor in sensors:
+        bias = {vectors.Magnetometer: 1e-9, vectors.Accelerometer: 1.0}.get(type(sensor), ARCSECOND)
+        units_of |= zip((f"{sensor.name}.{what}" for what in fields), (bias, ARCSECOND, 1e-3), strict=True)
+    errors: dict[str, Any] = {field: {} for field in fields.values()}
+    initial: dict[str, float] = {}
+    for name, size in sizes.items():
+        one_of("consider", name, units_of)
+        value = non_negative(f"consider {name}", size) * units_of[name]
+        sensor, _, what = name.rpartition(".")
+        if sensor == "initial":
+            initial[f"initial_{what}_sigma"] = value
+        else:
+            (errors[fields[what]] if sensor else errors)[sensor or name] = value
+    return {"consider": Consider(**errors), **initial}

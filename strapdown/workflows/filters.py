@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import ahrs, allan, covariance, gyro
-from strapdown.checks import Hint, InputError, instance, non_negative, one_of
+from strapdown import ahrs, allan, gyro
+from strapdown.checks import Hint, InputError, instance, one_of
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
-from strapdown.vectors import Accelerometer, Magnetometer
+from strapdown.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from strapdown.allan import NoiseFit
@@ -136,31 +135,6 @@ def filter_for_scenario(
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
     setups.need_angles(setup, kinds, "filter")
     return setup
-
-
-def considered(sizes: Mapping[str, float], sensors: Sequence[Any]) -> dict[str, Any]:
-    """Return 1σ of errors by name, in the units of a data sheet, as arguments of :func:`strapdown.covariance_analysis`.
-
-    scale_factor in ppm, misalignment in mrad, g_sensitivity in °/h/g; SENSOR.bias in nT, m/s² or arcsec by its kind, SENSOR.mounting in
-    arcsec, SENSOR.delay in ms; initial.attitude in °, initial.bias in °/h.
-    """
-    units_of = {"scale_factor": 1e-6, "misalignment": 1e-3, "g_sensitivity": DEGREE_PER_HOUR / STANDARD_GRAVITY}
-    units_of |= {"initial.attitude": DEGREE, "initial.bias": DEGREE_PER_HOUR}
-    fields = {"bias": "sensor_bias", "mounting": "mounting", "delay": "time_offset"}
-    for sensor in sensors:
-        bias = {Magnetometer: 1e-9, Accelerometer: 1.0}.get(type(sensor), ARCSECOND)
-        units_of |= zip((f"{sensor.name}.{what}" for what in fields), (bias, ARCSECOND, 1e-3), strict=True)
-    errors: dict[str, Any] = {field: {} for field in fields.values()}
-    initial: dict[str, float] = {}
-    for name, size in sizes.items():
-        one_of("consider", name, units_of)
-        value = non_negative(f"consider {name}", size) * units_of[name]
-        sensor, _, what = name.rpartition(".")
-        if sensor == "initial":
-            initial[f"initial_{what}_sigma"] = value
-        else:
-            (errors[fields[what]] if sensor else errors)[sensor or name] = value
-    return {"consider": covariance.Consider(**errors), **initial}
 
 
 def state_words(names: Sequence[str]) -> str:
