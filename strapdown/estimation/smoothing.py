@@ -334,16 +334,18 @@ class _ManyStates:
         if segments.shape[1] == 32:  # of the filter of six states: the blocks of P, not its triangle by rows
             order = np.argsort(covariance_blocks(_places()))
             segments = np.concatenate([segments[:, :11], segments[:, 11 + order], np.zeros((len(segments), 7))], axis=1)
-        states, matrices = np.zeros((4, n + 1)), forward.aligned_zeros(4, n * kernels.W + WIDTH)
+        states, matrices = np.zeros((4, n + 1)), forward.aligned_zeros(3, (n + smoother.ROWS) * kernels.W)
         noisy = np.array(kernels.NOISY, np.int64)
         others = (
-            forward.aligned_zeros(n * kernels.NOISY_WIDTH),
+            forward.aligned_zeros(n * kernels.NOISY_WIDTH + WIDTH)[:-WIDTH],
+            forward.aligned_zeros((n + smoother.ROWS) * kernels.NOISY_WIDTH),
+            forward.aligned_zeros((len(noisy) + smoother.ROWS) * kernels.NOISY_WIDTH),
             np.ones(len(noisy)),
             forward.aligned_zeros(3 * kernels.W),
-            np.zeros(2 * n),
+            np.zeros(n + kernels.NOISY_WIDTH),
             np.zeros(kernels.SET * max(len(model.last), 1)),
         )
-        space = smoother.Workspace._make((*states, *matrices, *others, noisy, len(noisy)))
+        space = smoother.Workspace._make((*states, *matrices, *others, noisy))
         models = smoother.Models(model, _with_negative_noise(model))
         compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
 

@@ -619,46 +619,31 @@ def noisy_row_at(A, i):
     return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_PARTS)
 
 
-def scale_noisy_row(A, i, factor):
-    """Multiply row i of such a matrix by a factor, and return it."""
-    row = tuple(factor * t for t in noisy_row_at(A, i))
+def put_noisy_row(A, i, factor, row):
+    """Write a factor times a row to row i of such a matrix."""
     for c, t in zip(NOISY_PARTS, row, strict=True):
-        store(A, NOISY_WIDTH * i + c, t)
-    return row
-
-
-def subtract_noisy_row(A, i, factor, row):
-    """Subtract a factor times a row from row i of such a matrix."""
-    for c, t, u in zip(NOISY_PARTS, noisy_row_at(A, i), row, strict=True):
-        store(A, NOISY_WIDTH * i + c, t - factor * u)
+        store(A, NOISY_WIDTH * i + c, factor * t)
 
 
 def gather_noisy_columns(A, B):
-    """Write the columns of a matrix (rows of W) for the states with process noise to B."""
+    """Write the columns of a matrix (rows of W), of which only rows of states with process noise are not zero, for these states to B."""
     for i in STATES:
-        for c, k in enumerate(NOISY):
-            B[NOISY_WIDTH * i + c] = A[W * i + k]
+        if i in NOISY:
+            for c, k in enumerate(NOISY):
+                B[NOISY_WIDTH * i + c] = A[W * i + k]
+        else:
+            for c in NOISY_PARTS:
+                store(B, NOISY_WIDTH * i + c, lanes_of(EIGHT))
 
 
-def scatter_noisy_columns(A, B):
-    """Write the rows of A (rows of W), one for each state with process noise, to the columns of these states in B."""
+def scatter_noisy_columns(columns, block, P):
+    """Write such columns to P on both sides of the diagonal; ``block`` has the rows of the states with process noise."""
     for c, k in enumerate(NOISY):
         for i in STATES:
-            B[W * i + k] = A[W * c + i]
-
-
-def rows_of_noisy(A, B):
-    """Write the rows of A for the states with process noise to the first rows of B."""
-    for c, k in enumerate(NOISY):
-        for first in PARTS:
-            put_part(B, c, first, part(A, k, first, 0.0))
-
-
-def rows_to_noisy(A, B):
-    """Write the first rows of A to the rows of B for the states with process noise."""
-    for c, k in enumerate(NOISY):
-        for first in PARTS:
-            put_part(B, k, first, part(A, c, first, 0.0))
+            if i not in NOISY:
+                P[W * i + k] = P[W * k + i] = columns[NOISY_WIDTH * i + c]
+        for d, j in enumerate(NOISY):
+            P[W * k + j] = block[NOISY_WIDTH * c + d]
 
 
 def transition_formula(x, delta, dt, model, coefficients, top, like):

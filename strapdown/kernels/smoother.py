@@ -12,7 +12,6 @@ eight columns.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,22 +22,20 @@ from strapdown.kernels.filter import (
     fixed_turn,
     gather_noisy_columns,
     minus_row,
+    noisy_row_at,
     predict_state,
+    put_noisy_row,
     put_row,
     rotate_vectors,
     row_at,
-    rows_of_noisy,
-    rows_to_noisy,
-    scale_noisy_row,
     scatter_noisy_columns,
-    subtract_noisy_row,
     transform,
     turn_attitude,
     turn_vectors,
     write_noise,
     write_transition,
 )
-from strapdown.kernels.lane_values import WIDTH, load, store
+from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
 
@@ -47,22 +44,23 @@ OPEN = (
     "fill_coefficients",
     "gather_noisy_columns",
     "minus_row",
+    "noisy_row_at",
     "predict_state",
+    "put_noisy_row",
     "put_row",
     "rotate_vectors",
     "row_at",
-    "rows_of_noisy",
-    "rows_to_noisy",
-    "scale_noisy_row",
     "scatter_noisy_columns",
-    "subtract_noisy_row",
     "transform",
     "turn_attitude",
     "turn_vectors",
     "write_noise",
     "write_transition",
 )
-CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows")
+CALLED = ("factorise", "solve", "add_product", "load_segment", "write_small_columns")
+
+ROWS = 6
+"""Rows that :func:`add_product` computes together."""
 
 
 class Models(NamedTuple):
@@ -73,7 +71,10 @@ class Models(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """State at the end of a segment, and work space, for n states; matrices are by rows, padded, with eight numbers more."""
+    """State at the end of a segment, and work space, for n states.
+
+    Matrices are by rows, padded, with ``ROWS`` rows more, which :func:`add_product` may read; ``gain`` with eight numbers more.
+    """
 
     x: np.ndarray
     """Filtered state at the start of the segment (n + 1,)."""
@@ -83,25 +84,26 @@ class Workspace(NamedTuple):
     later_x: np.ndarray
     """Smoothed state."""
     P: np.ndarray
-    """Filtered covariance at the start of the segment; then the Cholesky factor of P + Q̄."""
+    """Filtered covariance at the start of the segment; then the factor of P + Q̄ (:func:`factorise`)."""
     Q: np.ndarray
     """Q̄, whose other elements than those of a step are zero."""
-    work: np.ndarray
     later_P: np.ndarray
     """Smoothed covariance."""
     gain: np.ndarray
-    """(P + Q̄)⁻¹ Q̄, with columns for the states with process noise; −(P + Q̄)⁻¹ P of those whose noise is larger."""
+    """(P + Q̄)⁻¹ Q̄, with columns for the states with process noise, −(P + Q̄)⁻¹ P of those whose noise is larger; then those of Nᵀ."""
+    columns: np.ndarray
+    """The same columns of Q̄, then of ``Y Nᵀ + Q̄``."""
+    block: np.ndarray
+    """The rows of these states of ``N (Y Nᵀ + Q̄)``, with the same columns."""
     kept: np.ndarray
     """1 for the columns of the first form, 0 for the others."""
     top: np.ndarray
     """Rows of the attitude of Φ⁻¹ (3 × padded width)."""
     error: np.ndarray
-    """Smoothed error relative to the predicted state, then to the filtered one (n,), and as many numbers more."""
+    """Smoothed error relative to the predicted state, then to the filtered one (n,), and the numbers of a row of ``gain``."""
     coefficients: np.ndarray
     states: np.ndarray
     """States with process noise."""
-    noisy: int
-    """Their number."""
 
 
 class Outputs(NamedTuple):
@@ -136,46 +138,66 @@ def mirror(P, n, width):
 
 
 def factorise(A, n, width):
-    """Replace the upper triangle of A by its Cholesky factor U, ``A = Uᵀ U``; the diagonal holds the reciprocals of U's."""
+    """Replace the upper triangle of A by U in ``A = Uᵀ D⁻¹ U``, with D the diagonal of U; the diagonal then holds D⁻¹."""
     for i in range(n):
         row = row_at(A, i)
         for k in range(i):
-            row = minus_row(row, A[width * k + i], row_at(A, k))
+            row = minus_row(row, A[width * k + i] * A[width * k + k], row_at(A, k))
         put_row(A, i, 1.0, row)
-        inverted = 1.0 / math.sqrt(A[width * i + i])
-        put_row(A, i, inverted, row)
-        A[width * i + i] = inverted
+        A[width * i + i] = 1.0 / A[width * i + i]
 
 
 def solve(U, B, n, width):
-    """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``.
+    """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ D⁻¹ U X = B``; U as :func:`factorise` leaves it.
 
-    Each row of X is subtracted from the others as soon as it is known: these do not wait for each other, as terms of a sum would.
+    Two rows of X are subtracted from the others as soon as they are known: these do not wait for each other, as terms of a sum would.
     """
+    for i in range(0, n - 1, 2):
+        first, second = noisy_row_at(B, i), noisy_row_at(B, i + 1)
+        a, b = U[width * i + i], U[width * (i + 1) + i + 1]
+        second = minus_row(second, a * U[width * i + i + 1], first)
+        put_noisy_row(B, i + 1, 1.0, second)
+        for k in range(i + 2, n):
+            row = minus_row(noisy_row_at(B, k), a * U[width * i + k], first)
+            put_noisy_row(B, k, 1.0, minus_row(row, b * U[width * (i + 1) + k], second))
     for i in range(n):
-        row = scale_noisy_row(B, i, U[width * i + i])
-        for k in range(i + 1, n):
-            subtract_noisy_row(B, k, U[width * i + k], row)
-    for i in range(n - 1, -1, -1):
-        row = scale_noisy_row(B, i, U[width * i + i])
-        for k in range(i - 1, -1, -1):
-            subtract_noisy_row(B, k, U[width * k + i], row)
+        put_noisy_row(B, i, U[width * i + i], noisy_row_at(B, i))
+    for i in range(n - 1, 0, -2):
+        second, first = noisy_row_at(B, i), noisy_row_at(B, i - 1)
+        first = minus_row(first, U[width * (i - 1) + i] * U[width * (i - 1) + i - 1], second)
+        put_noisy_row(B, i - 1, 1.0, first)
+        for k in range(i - 1):
+            a = U[width * k + k]
+            row = minus_row(noisy_row_at(B, k), a * U[width * k + i], second)
+            put_noisy_row(B, k, 1.0, minus_row(row, a * U[width * k + i - 1], first))
 
 
-def subtract_products(gain, A, B, n, noisy):
-    """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise; three rows at once."""
-    width = len(gain) // n
-    for r in range(0, noisy, 3):
-        s, t = min(r + 1, noisy - 1), min(r + 2, noisy - 1)
-        first, second, third = row_at(B, r), row_at(B, s), row_at(B, t)
-        for k in range(n):
-            row = row_at(A, k)
-            first = minus_row(first, gain[width * k + r], row)
-            second = minus_row(second, gain[width * k + s], row)
-            third = minus_row(third, gain[width * k + t], row)
-        put_row(B, r, 1.0, first)
-        put_row(B, s, 1.0, second)
-        put_row(B, t, 1.0, third)
+def add_product(A, row, column, B, C, count, inner, width):
+    """Add A B to C, which has ``count`` rows of ``width``; element (i, k) of A is ``A[row * i + column * k]``, with ``inner`` values of k.
+
+    Six rows at once, so that their sums do not wait for each other; rows after the last are read and written too.
+    """
+    for c in range(0, width, WIDTH):
+        for i in range(0, count, ROWS):
+            s = width * i + c
+            t0, t1, t2 = load(C, s), load(C, s + width), load(C, s + 2 * width)
+            t3, t4, t5 = load(C, s + 3 * width), load(C, s + 4 * width), load(C, s + 5 * width)
+            a = row * i
+            for k in range(inner):
+                b = load(B, width * k + c)
+                t0 = t0 + A[a] * b
+                t1 = t1 + A[a + row] * b
+                t2 = t2 + A[a + 2 * row] * b
+                t3 = t3 + A[a + 3 * row] * b
+                t4 = t4 + A[a + 4 * row] * b
+                t5 = t5 + A[a + 5 * row] * b
+                a += column
+            store(C, s, t0)
+            store(C, s + width, t1)
+            store(C, s + 2 * width, t2)
+            store(C, s + 3 * width, t3)
+            store(C, s + 4 * width, t4)
+            store(C, s + 5 * width, t5)
 
 
 def step_back(segments, k, models, space):
@@ -184,9 +206,10 @@ def step_back(segments, k, models, space):
     A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ.
     """
     x, predicted, after = space.x, space.predicted, space.after
-    P, Q, gain, kept, work = space.P, space.Q, space.gain, space.kept, space.work
+    P, Q, gain, kept, columns, block = space.P, space.Q, space.gain, space.kept, space.columns, space.block
     later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
-    n, width, noisy = len(x) - 1, len(space.top) // 3, space.noisy
+    n, width, noisy = len(x) - 1, len(space.top) // 3, len(space.states)
+    noisy_width = len(gain) // n
     load_segment(segments, k, x, P, width)
     dt = segments[k, 0]
     part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
@@ -201,27 +224,29 @@ def step_back(segments, k, models, space):
     write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
     copy_state(predicted, after)
     transform(after, later_P, back, -dt, models.backward, coefficients, 0.0)
-    gather_noisy_columns(Q, gain)
-    small = gather_small_columns(P, Q, gain, kept, space.states, n, width)
+    clear(columns, n * noisy_width)
+    gather_noisy_columns(Q, columns)
+    for i in range(0, n * noisy_width, WIDTH):
+        store(gain, i, load(columns, i))
+    write_small_columns(P, Q, gain, kept, space.states, n, width)
     for i in range(0, n * width, WIDTH):
         store(P, i, load(P, i) + load(Q, i))
     factorise(P, n, width)
     solve(P, gain, n, width)
-    reduce_error(error, gain, kept, space.states, n)
+    subtract_from_kept(gain, kept, space.states, noisy_width)
+    reduce_error(error, gain, space.states, n)
     # N (Y Nᵀ + Q̄), Y the later covariance at the start: only rows and columns of states with noise differ from those of Y.
-    rows_of_noisy(later_P, work)
-    if small:
-        clear_rows(work, kept, width)
-    subtract_products(gain, later_P, work, n, noisy)
-    scatter_noisy_columns(work, later_P)
-    for i in range(0, n * width, WIDTH):
-        store(later_P, i, load(later_P, i) + load(Q, i))
-    rows_of_noisy(later_P, work)
-    if small:
-        clear_rows(work, kept, width)
-    subtract_products(gain, later_P, work, n, noisy)
-    rows_to_noisy(work, later_P)
+    add_product(later_P, width, 1, gain, columns, n, n, noisy_width)
+    clear(block, 0)
+    add_product(gain, 1, noisy_width, columns, block, noisy, n, noisy_width)
+    scatter_noisy_columns(columns, block, later_P)
     correct_filtered(x, error, later_x, later_P)
+
+
+def clear(A, start):
+    """Set A to zero from ``start`` on."""
+    for i in range(start, len(A), WIDTH):
+        store(A, i, broadcast(0.0))
 
 
 def copy_state(x, y):
@@ -235,37 +260,36 @@ def apply_error(error, top, coefficients):
     apply_transition(error, top, coefficients, 0.0)
 
 
-def gather_small_columns(P, Q, gain, kept, states, n, width):
-    """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's; return whether there are any."""
-    columns, small = len(gain) // n, False
+def write_small_columns(P, Q, gain, kept, states, n, width):
+    """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's; ``kept`` is 0 for these."""
+    columns = len(gain) // n
     for r in range(len(states)):
         k = states[r]
         kept[r] = 1.0
         if P[width * k + k] < Q[width * k + k]:
             kept[r] = 0.0
-            small = True
             for i in range(n):
                 gain[columns * i + r] = -P[width * min(i, k) + max(i, k)]
-    return small
 
 
-def clear_rows(A, kept, width):
-    """Set the rows of these states to zero."""
-    for r in range(len(kept)):
-        for c in range(width):
-            A[width * r + c] *= kept[r]
-
-
-def reduce_error(error, gain, kept, states, n):
-    """Replace the error by N times it; ``states`` are those with process noise."""
-    width = len(gain) // n
+def subtract_from_kept(gain, kept, states, width):
+    """Replace the gain by the columns of Nᵀ for the states with process noise."""
+    for i in range(0, len(gain), WIDTH):
+        store(gain, i, -1.0 * load(gain, i))
     for r in range(len(states)):
-        t = 0.0
-        for k in range(n):
-            t += gain[width * k + r] * error[k]
-        error[n + r] = kept[r] * error[states[r]] - t
+        gain[width * states[r] + r] += kept[r]
+
+
+def reduce_error(error, gain, states, n):
+    """Replace the error by N times it; ``gain`` has the columns of Nᵀ for the ``states`` with process noise."""
+    product = error[n:]
+    put_noisy_row(product, 0, error[0], noisy_row_at(gain, 0))
+    row = noisy_row_at(product, 0)
+    for k in range(1, n):
+        row = minus_row(row, -error[k], noisy_row_at(gain, k))
+    put_noisy_row(product, 0, 1.0, row)
     for r in range(len(states)):
-        error[states[r]] = error[n + r]
+        error[states[r]] = product[r]
 
 
 def relative_error(predicted, later_x, later_P, error):
