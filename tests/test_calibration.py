@@ -126,6 +126,19 @@ def test_missing_motion_is_said():
     assert delay.endswith("σ of magnetometer delay is 6 ms, good is 3.")
 
 
+def test_an_interval_begins_with_the_sample_after_its_edge():
+    """A rate and a force that grow with the time: its integral by the trapezium, which is exact for it, and every sample once."""
+    time, edges = np.arange(41) / 16.0, [0, *range(3, 40, 4), 40]
+    ramp = time[:, None] * [1.0, -2.0, 3.0]
+    gathered = intervals.gathered([Recording(source="ramp", time=time, rate=ramp, specific_force=ramp)])
+    np.testing.assert_allclose(gathered.time, time[edges])
+    np.testing.assert_allclose(gathered.length, np.diff(time[edges]))
+    np.testing.assert_allclose(gathered.angle.sum(axis=1), 0.5 * np.diff(time[edges] ** 2)[:, None] * [1.0, -2.0, 3.0])
+    np.testing.assert_array_equal(gathered.force.number, np.diff(edges))
+    np.testing.assert_array_equal(gathered.force.samples[gathered.force.known > 0.0], ramp[1:])
+    np.testing.assert_array_equal(gathered.rate[gathered.step > 0.0], ramp[1:])
+
+
 def test_the_prediction_has_the_derivatives_of_its_differences(turned):
     _, recording, _ = turned
     first = dataclasses.replace(
@@ -176,13 +189,23 @@ def test_the_equations_have_the_derivatives_of_their_differences(turned):
     turn = intervals.predicted(gathered, fitting.unpacked(errors), np.zeros((len(gathered.node), 3))).turn
     attitude = calibrating._gyro_frames(gathered, turn) @ Rotation.from_rotvec(small).as_matrix()
     x = fitting.Unknowns(errors, attitude, nodes)
-    problem = fitting.Problem(gathered, fitting.Prior(np.zeros(33), np.ones(33)), 9.81)
+    prior = fitting.Prior(0.02 * random.standard_normal(33), random.uniform(0.5, 2.0, 33))
+    problem = fitting.Problem(gathered, prior, 9.81)
     equations = problem.equations(x)
+    np.testing.assert_allclose(equations.residual[equations.kinds["prior"]], (errors - prior.mean) / prior.sigma)
+    # the mean of white noise N (m/s²/√Hz) over a time L has σ = N/√L, and a change of velocity Δv over it is the mean force Δv/L
+    first = equations.kinds["force"].start + np.arange(3)
+    by_velocity = equations.jacobian[first, fitting.VELOCITY + np.arange(3)]
+    np.testing.assert_allclose(by_velocity, 1.0 / (problem.noise["force"] * np.sqrt(gathered.length[0])))
     step = random.standard_normal(equations.columns)
     change = problem.equations(x.moved(1e-6 * step)).residual - problem.equations(x.moved(-1e-6 * step)).residual
     for rows in equations.kinds.values():
         slope = (equations.jacobian @ step)[rows]
         np.testing.assert_allclose(change[rows] / 2e-6, slope, rtol=0.0, atol=1e-5 * np.max(np.abs(slope)))
+    J, r = equations.jacobian, equations.residual
+    lower, _, gain = fitting._descended(problem, x, (J.T @ J).tocsc(), J.T @ r, r @ r, 1e-3)
+    assert gain == pytest.approx(1.0 - np.sum(problem.equations(lower).residual ** 2) / np.sum(r**2), rel=1e-9)
+    assert 0.0 < gain < 1.0
 
 
 def test_sigma_of_the_field_matrix_is_that_of_its_mean_scale_of_one(turned):

@@ -240,6 +240,8 @@ def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
     small, truth = estimate(0.1)
     small = consistency.judge(of_a_recording(small), truth)
     assert small.verdict == "consistent"
+    total = math.sqrt(np.mean((2.0 * np.arccos(estimate()[0].attitude[:, 0])) ** 2) / 3e-6)
+    assert f"RMS over σ: total {total:.2g}, heading" in small.reason
     assert all(finding.low <= finding.value <= finding.high for finding in small.findings)  # as it passes
     large, truth = estimate(0.1, bias_error=10.0)
     assert consistency.judge(of_a_recording(large), truth).verdict == "not consistent"

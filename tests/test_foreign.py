@@ -154,6 +154,11 @@ def test_a_bias_held_at_zero_is_named(run):
     (no_bias,) = (explanation for explanation in outcome.explanations if explanation.name == foreign.NO_BIAS)
     assert no_bias.likely
     assert no_bias.value == f"{np.sqrt(np.mean(np.sum(bias**2, axis=1))) / DEGREE * 3600.0:.3g} °/h"
+    # from three of its σ on
+    own, P = alignment.series_of("", [0.0, 1.0], np.eye(4)[:2], bias=np.zeros((2, 3))), np.tile(np.eye(6), (2, 1, 1))
+    for sigmas, p_value in ((2.9, 1.0), (3.1, 0.0)):
+        truth = Truth(attitude=own.attitude, bias=np.full((2, 3), sigmas))
+        assert next(foreign._zero_bias(own, truth, P)).p_value == p_value
 
 
 def command(monkeypatch, capsys, *arguments):

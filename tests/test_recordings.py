@@ -284,7 +284,8 @@ def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     np.testing.assert_array_equal(recording.time, [0.01, 0.02, 0.05, 0.06, 0.07])
     np.testing.assert_allclose(recording.specific_force[:, 0], [1, 2, 5, 6, 7])
     np.testing.assert_array_equal(recording.missing_gyro, [0.0, 0.03, 0.04])
-    np.testing.assert_array_equal(recording.since(1).missing_gyro, [0.03, 0.04])
+    for first in (0, 1):
+        np.testing.assert_array_equal(recording.since(first).missing_gyro, [0.03, 0.04])
     # The trapezoid over the joined interval; of a rate that changes evenly it is right.
     np.testing.assert_allclose(recordings.increments(recording)[1, 0], 0.5 * (0.2 + 0.5) * 0.03, rtol=1e-14)
     assert recording.left_out_words.startswith("3 rows without a gyro sample, the first at 0.000 s, were left out")
@@ -467,9 +468,11 @@ def test_since():
         time=np.arange(5.0),
         rate=np.arange(15.0).reshape(5, 3),
         specific_force=np.ones((5, 3)),
+        temperature=[20, 21, 22, 23, 24],
         movement=np.array([0, 0, 1, 1, 1], bool),
     )
     later = recording.since(2)
+    np.testing.assert_array_equal(later.temperature / 2.0, [11.0, 11.5, 12.0])
     np.testing.assert_array_equal(later.time, [2.0, 3.0, 4.0])
     np.testing.assert_array_equal(later.rate, recording.rate[2:])
     assert later.movement.all()
