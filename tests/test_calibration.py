@@ -321,6 +321,8 @@ def test_a_file_gives_it_back(turned, tmp_path):
     calibration.write(unit, path)
     again = calibration.read(path)
     assert list(again.entries()) == list(unit.entries())
+    symmetric = [axes for name, axes, _ in unit.entries() if name == "accelerometer_matrix"]
+    assert symmetric == ["x", "xy", "xz", "y", "yz", "z"]
     assert list(again.sigma.entries()) == list(unit.sigma.entries())
     assert (again.source, again.magnetic_unit) == (unit.source, "uT")
 

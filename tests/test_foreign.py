@@ -153,6 +153,8 @@ def test_a_bias_held_at_zero_is_named(run):
     outcome = checked(run, bias=np.zeros_like(bias), true_bias=bias, innovations={})
     (no_bias,) = (explanation for explanation in outcome.explanations if explanation.name == foreign.NO_BIAS)
     assert no_bias.likely
+    assert [table.title for table in outcome.tables][1:] == ["Possible causes of the attitude errors"]
+    assert len(replace(outcome, explanations=()).tables) == 1
     assert no_bias.value == f"{np.sqrt(np.mean(np.sum(bias**2, axis=1))) / DEGREE * 3600.0:.3g} °/h"
     # from three of its σ on
     own, P = alignment.series_of("", [0.0, 1.0], np.eye(4)[:2], bias=np.zeros((2, 3))), np.tile(np.eye(6), (2, 1, 1))
@@ -423,6 +425,14 @@ def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():
         own = quaternion.multiply(fixed, quaternion.multiply(truth, body))
         fitted = alignment.fit(alignment.Series(time, own), alignment.Series(time, truth), ("fixed", "body"), 0.0)
         assert fitted.residual < 1e-9
+
+
+def test_a_clock_alone_is_found_far_from_its_start():
+    """Half a second off in the fastest motion, by steps until none changes it."""
+    stamps = np.arange(0.0, 60.0, 0.01)
+    time, truth = stamps[500:5000:10], alignment.Series(stamps, FLIGHT.motion.attitude(stamps))
+    own = alignment.Series(time - 0.5, FLIGHT.motion.attitude(time))
+    assert alignment.fit(own, truth, ("time",), 0.0).offset == pytest.approx(0.5, abs=1e-9)
 
 
 def test_sigma_of_the_alignment_is_honest():

@@ -168,6 +168,7 @@ UNIT = "INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu')"
         ([TOPICS, UNIT, GENERATED, "INSERT INTO messages VALUES (1, 1, 1)"], "too big|not authorized"),
         ([TOPICS, UNIT, MESSAGES, "INSERT INTO messages VALUES (1, 1, NULL, 'text')"], "1 messages are of no topic"),
         ([TOPICS, UNIT.replace("'/imu'", "NULL"), MESSAGES, MESSAGE], "1 messages are of no topic"),
+        ([TOPICS, UNIT.replace("'/imu'", "CAST(x'ff' AS TEXT)"), MESSAGES, MESSAGE], "topic �: message 1 is 1 bytes"),
         (["CREATE TABLE other (a)"], "it has no table topics"),
     ],
 )

@@ -184,7 +184,7 @@ def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_p
 @pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
 def test_a_truncated_bag_gives_what_is_whole_and_says_so(bag, suffix):
     values, content = imu(2000)
-    path = bag(suffix, content)
+    path = bag(suffix, [("/chatter", "String", START, "", "not counted"), *content])
     whole = path.read_bytes()
     kept = []
     for share in (0.5, 0.9):
