@@ -319,7 +319,7 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
             continue
         scale = max(float(np.mean(white * white)), 1e-300)
         scores[name] = -0.5 * (3.0 * math.log(scale) + float(np.mean(np.linalg.slogdet(P)[1])))
-        weight = effective_samples(white / math.sqrt(scale)) if name == "body" else weight
+        weight = effective_samples(white) if name == "body" else weight
     best = max(scores.values())
     likelihood = {name: math.exp(max(weight * (score - best), -700.0)) for name, score in scores.items()}
     return {name: value / sum(likelihood.values()) for name, value in likelihood.items()}
