@@ -451,6 +451,24 @@ def test_sigma_of_the_alignment_is_honest():
     assert low < np.mean(squares) < high * 1.1  # the scatter is estimated, 900 residuals
 
 
+@pytest.mark.parametrize("correlation", [0.6, 0.9])
+def test_sigma_of_an_alignment_is_honest_with_correlated_errors(correlation):
+    """Errors of first order, 40 draws of three parameters: with the effective samples of the squares, σ would be up to √2 too small."""
+    time = np.arange(0.0, 600.0, 0.2)
+    exact = quaternion.exp(0.3 * np.sin(np.outer(time, [0.3, 0.2, 0.11])))
+    truth = alignment.Series(time, exact)
+    squares = []
+    for seed in range(40):
+        drawn = np.random.default_rng([8, seed]).standard_normal((len(time), 3))
+        drawn[1:] *= np.sqrt(1.0 - correlation**2)
+        noise = scipy.signal.lfilter([1.0], [1.0, -correlation], drawn, axis=0)
+        own = alignment.Series(time, quaternion.multiply(exact, quaternion.exp(DEGREE * noise)))
+        a = alignment.fit(own, truth, ("body",), 0.0)
+        squares.append(a.body @ np.linalg.solve(a.covariance[3:6, 3:6], a.body) / 3.0)
+    low, high = consistency.mean_bounds(3, 40, 0.999)
+    assert low < np.mean(squares) < high * 1.05  # the scatter and its correlation are estimated
+
+
 def test_a_sparser_truth_is_taken_at_its_own_times(run):
     t = run.record.truth
     every = slice(3, None, 20)

@@ -257,7 +257,7 @@ def _descended(
         step = np.zeros(7)
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
         left = r - np.einsum("mij,j->mi", J, step[free])
-        share = len(r) / effective_samples(left) if len(r) > 10 else 1.0
+        share = len(r) / effective_samples(left, of_mean=True) if len(r) > 10 else 1.0
         covariance = np.zeros((7, 7))
         covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
         fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))

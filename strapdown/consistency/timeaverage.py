@@ -109,10 +109,11 @@ def squares_effective(white: ArrayLike) -> float:
     return float(max(1.0, m / max(total, 1.0) * max(1.0 - 4.0 * number / m, 0.05)))
 
 
-def effective_samples(white: ArrayLike, first: int | None = None) -> float:
+def effective_samples(white: ArrayLike, first: int | None = None, *, of_mean: bool = False) -> float:
     """Return the number of independent samples with the same variance of the mean of |z|² of the first components of the series (m, n).
 
-    ``m/(1 + 2 Σ_τ (1 − τ/m) ‖(A^τ)_first‖²/first)``, A by least squares.
+    ``m/(1 + 2 Σ_τ (1 − τ/m) ‖(A^τ)_first‖²/first)``, A by least squares; ``of_mean``: of the mean of z, with the trace of A^τ in place of
+    the squared norm.
     """
     z = array("white", white, ("m", "n"))
     m, n = z.shape
@@ -129,9 +130,11 @@ def effective_samples(white: ArrayLike, first: int | None = None) -> float:
     while lags[0] < m:
         share = np.minimum(np.sum(powers[:, :k, :k] ** 2, axis=(1, 2)) / k, 1.0)
         small = np.flatnonzero(share < 1e-6)
+        if of_mean:
+            share = np.minimum(np.trace(powers[:, :k, :k], axis1=1, axis2=2) / k, 1.0)
         end = small[0] + 1 if len(small) else POWERS
         total += float(np.sum((1.0 - lags / m).clip(0.0)[:end] * share[:end]))
         if len(small):
             break
         powers, lags = powers @ last, lags + POWERS
-    return float(max(1.0, m / (1.0 + 2.0 * total)))
+    return float(max(1.0, m / (1.0 + 2.0 * max(total, 0.0))))
