@@ -66,14 +66,15 @@ class Trace:
     def apply(self, function: Any, *arguments: Any) -> Any:
         """Return the result of a function known to numba for symbols and numbers."""
         operands = tuple(map(type_of, arguments))
-        kind, signature = self.signature(function, operands)
         if self.builder is None:
-            return symbols(signature.return_type)
+            return symbols(self.signature(function, operands)[1].return_type)
         key = (function, *map(id, operands))
         if key not in self._implementations:
-            self._implementations[key] = self.target.get_function(kind, signature)
+            kind, signature = self.signature(function, operands)
+            self._implementations[key] = self.target.get_function(kind, signature), signature
+        implementation, signature = self._implementations[key]
         values = [self.value(a, t) for a, t in zip(arguments, signature.args, strict=True)]
-        return symbols(signature.return_type, self._implementations[key](self.builder, values))
+        return symbols(signature.return_type, implementation(self.builder, values))
 
     def value(self, argument: Any, wanted: Any) -> Any:
         """Return the LLVM value of a symbol, number, or tuple of these, cast to type ``wanted``."""
@@ -188,7 +189,7 @@ class _Mathematics:
 def _shape(argument: Any) -> Any:
     if type(argument) is Symbol:
         return argument.type
-    return tuple(map(_shape, argument)) if isinstance(argument, tuple) else (argument,)
+    return tuple(map(_shape, argument)) if isinstance(argument, tuple) else (type(argument), argument)
 
 
 class Formula:
@@ -199,7 +200,8 @@ class Formula:
         self.pack = EMIT.get(function.__name__) if function.__module__.endswith(".algebra") else None
         self.never = called
         self.signature = inspect.signature(function)
-        self.known: dict[Any, bool] = {}
+        self.results: dict[Any, Any] = {}
+        """Results without values by the types of the arguments, from the first trace of types; :class:`NotAFormula` if it is none."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the result of the helper for symbols and numbers."""
@@ -212,17 +214,15 @@ class Formula:
             operands = [[trace.value(x, types.float64) for x in a] for a in arguments]
             return tuple(Symbol(types.float64, value) for value in self.pack(trace.builder, *operands))
         key = _shape(arguments)
-        if trace.builder is None and key not in self.known and not self.never:
+        if trace.builder is None and key not in self.results and not self.never:
             try:
-                result = self.function(*arguments)
+                self.results[key] = self.function(*arguments)
             except (NotAFormula, TypeError):  # not possible with symbols, perhaps with numba
-                self.known[key] = False
-            else:
-                self.known[key] = True
-                return result
-        if self.known.get(key):
-            return self.function(*arguments)
-        return trace.apply(self.plain, *arguments)
+                self.results[key] = NotAFormula
+        result = self.results.get(key, NotAFormula)
+        if result is NotAFormula:
+            return trace.apply(self.plain, *arguments)
+        return result if trace.builder is None else self.function(*arguments)
 
 
 def _short_range(*bounds: Any) -> range:
