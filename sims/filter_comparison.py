@@ -34,12 +34,11 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, scenarios, vectors
-from strapdown.ahrs import HAND_HELD, AhrsParameters
+from strapdown import ahrs, consistency, covariance, estimation, montecarlo, quaternion, scenarios, vectors
+from strapdown.ahrs import HAND_HELD
 from strapdown.checks import Array
 from strapdown.consistency import alignment, reference_errors
-from strapdown.estimation import State, filters, setup
-from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation import State, setup
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
@@ -286,22 +285,19 @@ def main(
     predicted = covariance.analyse(scene, base, epochs=20)
     bound = float(np.sqrt(np.mean(np.diagonal(predicted.cramer_rao, axis1=1, axis2=2)[10:, :3])))
     records = [scenarios.simulate(scene, seed, run) for run in range(runs)]
-    outcomes = []
-    for name in filters.FILTERS:
-        squares, nees, spent = [], [], []
-        filters.run(name, records[0], base.process_noise, starts(records[0], plan, 0))  # compiles
-        for run, record in enumerate(records):
-            begun = clock.process_time()
-            estimate = filters.run(name, record, base.process_noise, starts(record, plan, run), full_covariance=True)
-            spent.append(clock.process_time() - begun)
-            error = errors_of(estimate.attitude, record)
-            squares.append(np.mean(error**2))
-            assert estimate.covariance is not None
-            nees.append(float(consistency.nees(error[-1], estimate.covariance[-1, :3, :3])))
-        low, high = consistency.mean_bounds(3, len(nees))
-        outcomes.append(
-            _outcome(name, squares, spent, bound, len(records[0].increments), np.mean(nees) / 3.0, (low, high))
-        )
+    squares, nees, spent = [], [], []
+    estimation.run(records[0], base.process_noise, starts(records[0], plan, 0))  # compiles
+    for run, record in enumerate(records):
+        begun = clock.process_time()
+        estimate = estimation.run(record, base.process_noise, starts(record, plan, run), full_covariance=True)
+        spent.append(clock.process_time() - begun)
+        error = errors_of(estimate.attitude, record)
+        squares.append(np.mean(error**2))
+        assert estimate.covariance is not None
+        nees.append(float(consistency.nees(error[-1], estimate.covariance[-1, :3, :3])))
+    low, high = consistency.mean_bounds(3, len(nees))
+    samples_per_run = len(records[0].increments)
+    outcomes = [_outcome("mekf", squares, spent, bound, samples_per_run, np.mean(nees) / 3.0, (low, high))]
     trained = [scenarios.simulate(scene, seed + 1000, run) for run in range(training)]
     for name, (package, peer) in PEERS.items():
         if importlib.util.find_spec(package) is None:
@@ -321,7 +317,7 @@ def main(
         results = [(attitude(record, best), record) for record in records]
         squares = [np.mean(errors_of(q, record) ** 2) for (q, _), record in results]
         spent = [seconds for (_, seconds), _ in results]
-        outcomes.append(_outcome(name, squares, spent, bound, len(records[0].increments), np.nan, None, best))
+        outcomes.append(_outcome(name, squares, spent, bound, samples_per_run, np.nan, None, best))
     result = Result(
         outcomes=tuple(outcomes), bound=bound, recorded=on_recordings(recorded, progress) if recorded else {}
     )
@@ -355,17 +351,6 @@ def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
     return result.recording.time, result.estimate.attitude
 
 
-def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
-    """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the same measurements as the MEKF."""
-    result = ahrs.estimate(recording, AhrsParameters())
-    noise = HAND_HELD.setup.process_noise
-    factor = 8.0 * gain  # fixed gains must also allow for disturbances
-    scaled = ProcessNoise(
-        angle_random_walk=factor * noise.angle_random_walk, rate_random_walk=factor**2 * noise.rate_random_walk
-    )
-    return result.record.time, filters.run("mahony", result.record, scaled, result.initial).attitude
-
-
 def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array, Array]]:
     """Return a peer as a function of a recording and a gain, on means of ``every`` samples."""
 
@@ -388,7 +373,6 @@ def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | N
     short = [_until(recording, float(recording.time[np.argmax(recording.movement)]) + SEARCHED) for recording in whole]
     candidates: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
         "strapdown estimate": ours,
-        "complementary": complementary,
     }
     candidates |= {
         name: peer_on(f, SLOW.get(name, 1)) for name, (package, f) in PEERS.items() if importlib.util.find_spec(package)

@@ -8,8 +8,8 @@ One tumbling body, a MEMS gyro, and four cases:
   between the true and the estimated reference in the body; the NEES shows whether the covariance of the unobservable rotation is right;
 - ``tracker``: as large, with a star tracker that measures the attitude, with a σ about its boresight ten times that across it.
 
-The filters are the package's MEKF and complementary filter, and others as short filters of one's own, in NumPy. All run on the same records
-from the same initial states. Run
+The filters are the package's MEKF, and others as short filters of one's own, in NumPy. All run on the same records from the same initial
+states. Run
 ``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all for the unscented filter). It prints a table and the
 findings for each case, and writes both with the figure and ``filter_family.json``.
 
@@ -29,7 +29,8 @@ geometric        [[I, 0], [[b⁺ − b], I]]             exp(−[a]) b + c − b
 with c the correction of δb. Right-invariant: Barrau & Bonnabel 2017; two-frame: the same 2023; equivariant: van Goor, Hamel & Mahony 2022,
 the row of a direction linearised at the mean of reference and measured direction, so that its error is of third order; geometric: Andrle &
 Crassidis 2015, with a largest correction that the paper does not have. ``usque`` is the unscented filter of Crassidis & Markley 2003; as in
-that paper, half of the process noise is added before a propagation and half after it.
+that paper, half of the process noise is added before a propagation and half after it. ``mahony`` is the complementary filter of Mahony,
+Hamel & Pflimlin 2008 with steady-state gains, and the covariance that its error has under them.
 
 Reasons for the differences. For small errors all Kalman filters propagate the same Gaussian in different coordinates, and only the fixed
 gains of Mahony's filter cost accuracy: one gain per sensor, which cannot weight the axes of a tracker. For a large error, the rotation that
@@ -53,7 +54,7 @@ import numpy as np
 
 from strapdown import consistency, estimation, plots, quaternion
 from strapdown.checks import Array, InputError
-from strapdown.estimation import State, filters
+from strapdown.estimation import State
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
@@ -98,7 +99,7 @@ DASHES = {"two-frame": (0, (5, 2, 1, 2))}
 
 EXTENDED = ("right-invariant", "two-frame", "equivariant", "geometric")
 NAMES = ("mekf", *EXTENDED, "usque", "mahony")
-"""All filters of the study; the first and the last are the package's."""
+"""All filters of the study; the first is the package's."""
 LARGEST_CORRECTION = 1.8954942670339809
 """Maximum correction of the geometric filter, rad: the root of θ = 2 sin θ, beyond which its bias would grow without limit."""
 
@@ -114,6 +115,9 @@ class Step(NamedTuple):
 
 def steps(record: ImuRecord) -> Iterator[Step]:
     """Yield the steps of a filter over a record."""
+    for series in record.vectors:
+        if series.kind not in ("direction", "attitude"):
+            raise InputError(f"{series.sensor} is a {series.kind}; these filters take directions and attitudes")
     times = [(t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time)]
     waiting = [due for due in sorted(times) if due[0] >= record.time[0]]
     now, rate = record.time[0], np.zeros((1, 3))
@@ -137,8 +141,6 @@ def rows_of(series: VectorMeasurements, k: int, q: Array, midway: bool) -> tuple
     if series.attitude is not None:
         y = quaternion.log(quaternion.multiply(quaternion.conjugate(q), series.attitude[k]))
         return np.eye(3), y, series.covariances[k]
-    if series.kind != "direction":
-        raise InputError(f"{series.sensor} is a {series.kind}; these filters take directions and attitudes")
     r, z = series.references_f[k], series.vector_b[k]
     predicted = quaternion.rotate(quaternion.conjugate(q), r)
     across = triad(predicted)[:2]
@@ -169,8 +171,7 @@ class Extended:
             if measured is None:
                 states.append((q, b, P))
                 continue
-            H, y, N = rows_of(*measured, q, self.name == "equivariant")
-            K = np.linalg.solve(H @ P[:3, :3] @ H.T + N, H @ P[:3]).T
+            H, y, N, K = self.linearised(*measured, q, P)
             left = np.eye(6)
             left[:, :3] -= K @ H
             P = left @ P @ left.T + K @ N @ K.T
@@ -178,6 +179,11 @@ class Extended:
             P = G @ P @ G.T
         attitude, bias, covariance = zip(*states, strict=True)
         return Estimate.from_arrays(record.time, attitude, covariance, bias=bias)
+
+    def linearised(self, series: VectorMeasurements, k: int, q: Array, P: Array) -> tuple[Array, Array, Array, Array]:
+        """Return H (d, 3), innovation (d,) and noise (d, d) of a measurement, and the gain (6, d)."""
+        H, y, N = rows_of(series, k, q, self.name == "equivariant")
+        return H, y, N, np.linalg.solve(H @ P[:3, :3] @ H.T + N, H @ P[:3]).T
 
 
 def corrected(name: str, q: Array, b: Array, correction: Array) -> tuple[Array, Array, Array]:
@@ -188,7 +194,7 @@ def corrected(name: str, q: Array, b: Array, correction: Array) -> tuple[Array, 
     turn, J, G = quaternion.exp(a), right_jacobian(a), np.eye(6)
     back = quaternion.to_matrix(turn).T
     b_next = b + c
-    if name == "mekf":
+    if name in ("mekf", "mahony"):
         G[:3, :3] = J
     elif name == "right-invariant":
         G[:3, :3] = back
@@ -199,6 +205,48 @@ def corrected(name: str, q: Array, b: Array, correction: Array) -> tuple[Array, 
         G[:3, :3] = G[3:, 3:] = back
         b_next = b + J @ c
     return quaternion.normalize(quaternion.multiply(q, turn)), b_next, G
+
+
+def steady_gains(record: ImuRecord, noise: ProcessNoise, initial: State) -> dict[str, Array]:
+    """Return the gains (2,) of attitude and bias (1/s) of each sensor: Farrenkopf's for all together, divided by information.
+
+    ``K_θ = 1 − ζ⁻²``, ``K_b = −σ_u √dt / (σ_n ζ)`` (Farrenkopf 1978). The random walks include the initial σ over the record, as a fixed
+    gain must be suitable for the start too.
+    """
+    first, last = record.time[0], record.time[-1]
+    sigmas = {s.sensor: s.sigma[(first <= s.time) & (s.time <= last)] for s in record.vectors}
+    information = {name: np.sum(sigma**-2.0) / (last - first) for name, sigma in sigmas.items()}
+    dt = (last - first) / min(map(len, sigmas.values()))
+    start = np.sqrt(np.diag(initial.covariance) / (last - first))
+    unit = np.sqrt(dt * sum(information.values()))
+    sv = np.hypot(noise.angle_random_walk, start[:3].max()) * unit * np.sqrt(dt)
+    su = np.hypot(noise.rate_random_walk, start[3:].max()) * unit * dt**1.5
+    gamma = np.sqrt(1.0 + sv**2 / 4.0 + su**2 / 48.0)
+    zeta = gamma + su / 4.0 + 0.5 * np.sqrt(2.0 * gamma * su + sv**2 + su**2 / 3.0)
+    total = np.array([1.0 - zeta**-2.0, -su / (dt * zeta)]) * (last - first) / (dt * sum(information.values()))
+    return {name: total * information[name] / len(sigma) for name, sigma in sigmas.items()}
+
+
+@dataclass(frozen=True)
+class Mahony(Extended):
+    """The complementary filter with fixed gains: a measurement rotates the attitude by the gain times ω_mes = z × R̂ᵀ r, equations (32).
+
+    Of a measured attitude ω_mes is that of the passive filter, sin θ about the rotation axis. The covariance is that of any gain (Joseph),
+    with ``ω_mes = H δθ + n``.
+    """
+
+    gains: dict[str, Array]
+    """Of each sensor, :func:`steady_gains`."""
+
+    def linearised(self, series: VectorMeasurements, k: int, q: Array, P: Array) -> tuple[Array, Array, Array, Array]:
+        """Return H (3, 3), ω_mes (3,) and its noise (3, 3), and the gain (6, 3)."""
+        K, N = np.kron(self.gains[series.sensor][:, None], np.eye(3)), series.covariances[k]
+        if series.attitude is not None:
+            d = quaternion.multiply(quaternion.conjugate(q), series.attitude[k])
+            return np.eye(3), 2.0 * d[0] * d[1:], N, K
+        predicted = quaternion.rotate(quaternion.conjugate(q), series.references_f[k])
+        across = skew(predicted)
+        return -across @ across, np.cross(series.vector_b[k], predicted), across @ N @ across.T, K
 
 
 def to_quaternion(p: Array) -> Array:
@@ -263,15 +311,13 @@ def updated(q: Array, b: Array, P: Array, series: VectorMeasurements, k: int) ->
     noise = series.covariances[k]
     if series.attitude is not None:
         residuals = to_rodrigues(quaternion.multiply(quaternion.conjugate(q), series.attitude[k])) - points[:, :3]
-    elif series.kind == "direction":
+    else:
         r = series.references_f[k]
         basis = triad(quaternion.rotate(quaternion.conjugate(q), r))
         residuals = (series.vector_b[k] - quaternion.rotate(quaternion.conjugate(attitudes), r)) @ basis.T
         noise = basis @ noise @ basis.T
         noise[2, :2] = noise[:2, 2] = 0.0
         noise[2, 2] = 0.5 * (noise[0, 0] + noise[1, 1])
-    else:
-        raise InputError(f"{series.sensor} is a {series.kind}; this filter takes directions and attitudes")
     mean, prior = WEIGHTS @ residuals, np.concatenate([np.zeros(3), b])
     S = (WEIGHTS * (residuals - mean).T) @ (residuals - mean) + noise
     gain = -np.linalg.solve(S, (WEIGHTS * (residuals - mean).T) @ (points - prior)).T
@@ -282,10 +328,16 @@ def updated(q: Array, b: Array, P: Array, series: VectorMeasurements, k: int) ->
 
 def estimated(name: str, record: ImuRecord, noise: ProcessNoise, initial: State) -> Estimate:
     """Return the estimate of a filter by its name, with whole covariances."""
-    if name in filters.FILTERS:
-        return filters.run(name, record, noise, initial, full_covariance=True)
-    own = Unscented(noise) if name == "usque" else Extended(name, noise)
-    return own.run(dataclasses.replace(record, truth=None), initial)
+    if name == "mekf":
+        return estimation.run(record, noise, initial, full_covariance=True)
+    return own_filter(name, record, noise, initial).run(dataclasses.replace(record, truth=None), initial)
+
+
+def own_filter(name: str, record: ImuRecord, noise: ProcessNoise, initial: State) -> Extended | Unscented:
+    """Return a filter of one's own by its name, for a record."""
+    if name == "mahony":
+        return Mahony(name, noise, steady_gains(record, noise, initial))
+    return Unscented(noise) if name == "usque" else Extended(name, noise)
 
 
 # The study

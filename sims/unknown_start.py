@@ -24,7 +24,7 @@ import numpy as np
 
 from strapdown import consistency, estimation, plots, quaternion, scenarios
 from strapdown.checks import Array
-from strapdown.estimation import filters, multiple_model
+from strapdown.estimation import multiple_model
 from strapdown.estimation.states import ProcessNoise
 from strapdown.plots import style
 from strapdown.randomness import generator
@@ -123,7 +123,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
             became_one.append(bank.became_one)
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
-            estimate = filters.run(name, record, noise, initial, every=EVERY, full_covariance=True)
+            estimate = estimation.run(record, noise, initial, every=EVERY, full_covariance=True)
             rows = np.arange(0, len(record.time), EVERY)
             became_one.append(0.0)
         truth = record.truth

@@ -10,7 +10,6 @@ from strapdown import estimation, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import LiveFilter, error_states, filters, multiple_model, setup
 from strapdown.estimation.error_states import BoundedVelocity, GaussMarkov, GyroForce, GyroScale, LeverArm, VectorBias
-from strapdown.estimation.filters import complementary
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.model import assemble
 from strapdown.estimation.schedule import schedule
@@ -87,17 +86,10 @@ def uneven():
     return replace(record, time=np.where(np.arange(len(record.time)) > 99, record.time + 0.01, record.time))
 
 
-def filtered(name="mahony", record=RECORD, process_noise=NOISE, initial=None, **options):
-    return filters.run(name, record, process_noise, start() if initial is None else initial, **options)
-
-
 def measured(**changes):
-    """Run both filters over a direction with this noise."""
+    """Run the filter over a direction with this noise."""
     arguments = {"kind": "direction", "time": [0.1], "vector_b": [X], "reference_f": X}
-    for run_ in (filters.run, lambda name, *rest: filters.FILTERS[name](*rest)):
-        with pytest.raises(InputError):
-            run_("mahony", resting(VectorMeasurements(sensor="sun", **arguments, **changes)), NOISE, start())
-    filters.run("mekf", resting(VectorMeasurements(sensor="sun", **arguments, **changes)), NOISE, start())
+    estimation.run(resting(VectorMeasurements(sensor="sun", **arguments, **changes)), NOISE, start())
 
 
 def predicted(**arguments):
@@ -216,16 +208,10 @@ TABLE = [
     (lambda: replace(RECORD, vectors=SERIES), {}, "(series,)"),
     (lambda: resting(X), {}, "vectors[0] is"),
     (lambda: records.compress(RECORD, "two-samples"), {}, "'two-sample'"),
-    # Filters of one interface.
-    (filtered, {"name": "mahoni"}, "'mahony'"),
-    *((filtered, {"name": name, "every": 0}, "every is 0") for name in filters.FILTERS),
-    *((filtered, {"name": name, "every": 1.5}, "every is 1.5") for name in filters.FILTERS),
-    *((filtered, {"name": name, "process_noise": start()}, "process_noise is State") for name in filters.FILTERS),
+    (run, {"every": 1.5}, "every is 1.5"),
     (measured, {"sigma": 0.0}, "sun: sigma[0] is 0 rad"),
     (measured, {"sigma_axes": [0.0, 1.0, 1.0]}, "sun: sigma_axes[0] has a 0"),
     (measured, {"covariance": np.diag([0.0, 1.0, 1.0])}, "sun: covariance[0] is singular"),
-    (lambda: complementary.run(RECORD, NOISE, start(), gains=5), {}, "gains has shape"),
-    (lambda: complementary.run(RECORD, NOISE, start(), gains=np.zeros((2, 2))), {}, "gains has shape"),
     (lambda: filters.compare(RECORD, NOISE, start(), filters=()), {}, "filters is empty"),
     (lambda: filters.compare(RECORD, NOISE, start(), filters=["mefk"]), {}, "'mekf'"),
     (banked, {"bias_sigma": [1.0, 2.0]}, "bias_sigma has shape (2,)"),
@@ -361,8 +347,7 @@ FACES = {
     "StepFilter": lambda record, *arguments: StepFilter(*arguments),
     "estimation.observability": estimation.observability,
     "multiple_model.run": lambda record, noise, initial: multiple_model.run(record, noise),
-    "filters.run": lambda *arguments: filters.run("mahony", *arguments),
-    "filters.compare": filters.compare,
+    "filters.compare": lambda *arguments: filters.compare(*arguments, filters=["mekf"]),
 }
 WRONG = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}
 CLASSES = dict(zip(WRONG, ("ImuRecord", "ProcessNoise", "State", "Gate", "Robust"), strict=True))

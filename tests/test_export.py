@@ -408,7 +408,7 @@ REFUSED = {
     "recovery": {"gate": sd.Gate()},
     "robust": {"robust": sd.Robust()},
     "integration": {"integration": sd.coning.ALGORITHMS["three-sample"]},
-    "estimator": {"estimator": "mahony"},
+    "estimator": {"estimator": lambda record, initial: None},
     "temperature": {"states": States(gyro_temperature_sigma=1e-5)},
     "record": {"states": States(sensors={"star": SensorStates(lever_arm_sigma=0.1)})},
     "varying": {},

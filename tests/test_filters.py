@@ -1,4 +1,4 @@
-"""Filters of one interface, and the filters of ``sims/filter_family.py``: formulas, pairs that must agree, truth and χ²."""
+"""The package's filter, and the filters of ``sims/filter_family.py``: formulas, pairs that must agree, truth and χ²."""
 
 import dataclasses
 from functools import cache
@@ -16,12 +16,9 @@ from sims import filter_family as comparison
 from strapdown import consistency, estimation, kinematics, motion, quaternion
 from strapdown.consistency import Verdict
 from strapdown.estimation import filters
-from strapdown.estimation.filters import complementary
-from strapdown.kernels import complementary as complementary_kernel
-from strapdown.kernels import measurement
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
-from strapdown.vectors import VectorMeasurements, triad
+from strapdown.vectors import VectorMeasurements
 
 BODY = motion.HarmonicRates(
     mean=(0.05, -0.1, 0.3), harmonics=(motion.Harmonic(amplitude=(0.2, 0.1, 0.0), frequency=0.1, phase=0.3),)
@@ -37,7 +34,7 @@ FORMS = ("scalar", "each sample", "axes", "axes of each sample", "covariance", "
 ONE_SIGMA = ("scalar", "each sample")
 CASES = [(kind, form) for kind in REFERENCES for form in FORMS if kind != "heading" or form in ONE_SIGMA]
 """Every kind of measurement with every form of noise that it has."""
-OWN_CASES = [(kind, form) for kind in ("direction", "attitude") for form in ("scalar", "covariance of each sample")]
+SIMPLE_CASES = [(kind, form) for kind in ("direction", "attitude") for form in ("scalar", "covariance of each sample")]
 SHARPEST = [(kind, "each sample" if kind == "heading" else "covariance of each sample") for kind in REFERENCES]
 """Each kind with the form of noise that needs most of the code."""
 UNEVEN = np.array([1.5, 0.4, 0.8])
@@ -118,39 +115,10 @@ def started(record, rng, *, attitude_sigma, bias_sigma):
     return drawn_start(record.truth, rng.standard_normal(6), attitude_sigma, bias_sigma)
 
 
-def own_filter(name, noise):
-    return comparison.Unscented(noise) if name == "usque" else comparison.Extended(name, noise)
-
-
 def body_rows_midway(rows, r_b, z):
     """H (n, 3) of the equivariant filter, body side: ``z − r_b = ½ (z + r_b) × δθ``, of what lies across r_b."""
     across = np.eye(3) - np.outer(r_b, r_b)
     return rows @ across @ kinematics.skew(0.5 * (z + r_b))
-
-
-@pytest.mark.parametrize("kind", ["direction", "vector", "attitude"])
-def test_nis_of_mahonys_filter_is_that_of_the_whole_innovation(kind):
-    """One update under a prior with correlations: the sum of the whitened squares is eᵀ S⁻¹ e."""
-    rng = np.random.default_rng(6)
-    M = rng.standard_normal((6, 6)) * 1e-5
-    initial = estimation.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=np.zeros(3), covariance=M @ M.T)
-    r, sigma = REFERENCES["direction"], 1e-5
-    r_b = in_body(initial.attitude, r)
-    off = 2e-5 * rng.standard_normal(3)
-    rows = np.linalg.svd(r_b[None])[2][1:] if kind == "direction" else np.eye(3)
-    if kind == "attitude":
-        fields = {"attitude": quaternion.multiply(initial.attitude, quaternion.exp(off))[None]}
-        H, e = np.eye(3), off
-    else:
-        z = r_b + off
-        z = z if kind == "vector" else z / np.linalg.norm(z)
-        fields = {"vector_b": z[None], "reference_f": r}
-        H, e = rows @ kinematics.skew(r_b), rows @ (z - r_b)
-    series = VectorMeasurements(sensor="sun", kind=kind, time=[0.0], sigma=sigma, **fields)
-    record = resting(series)
-    S = H @ initial.covariance[:3, :3] @ H.T + sigma**2 * np.eye(len(rows))
-    nis = filters.run("mahony", record, BELIEF, initial).innovations["sun"].nis
-    np.testing.assert_allclose(nis, [e @ np.linalg.solve(S, e)], rtol=1e-8)
 
 
 # -------------------------------------------------------------------------------------------- the two-frames group and others
@@ -172,7 +140,7 @@ def test_invariant_filters_never_see_what_one_reference_hides():
     )
     about = {}
     for name in ("mekf", *comparison.EXTENDED):
-        estimate = own_filter(name, BELIEF).run(record, initial)
+        estimate = comparison.own_filter(name, record, BELIEF, initial).run(record, initial)
         r_b = in_body(estimate.attitude, r)
         about[name] = np.einsum("ki,kij,kj->k", r_b, estimate.covariance[:, :3, :3], r_b)
     for name in ("right-invariant", "two-frame"):
@@ -193,20 +161,19 @@ def test_the_unscented_filter_tends_to_the_mekf_for_small_errors():
     noise = estimation.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-9)
     initial = started(record, rng, attitude_sigma=1e-4, bias_sigma=1e-5)
     reference = estimation.run(record, noise, initial, full_covariance=True)
-    estimate = own_filter("usque", noise).run(record, initial)
+    estimate = comparison.Unscented(noise).run(record, initial)
     sigma = reference.sigma.max(axis=0)
     assert quaternion.angle_between(estimate.attitude, reference.attitude).max() < 1e-7
     assert np.abs((estimate.bias - reference.bias) / sigma[3:]).max() < 2e-3
     assert np.abs((estimate.covariance - reference.covariance) / np.outer(sigma, sigma)).max() < 2e-3
 
 
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_every_and_variance_give_the_same_as_the_whole(name):
+def test_every_and_variance_give_the_same_as_the_whole():
     rng = np.random.default_rng(13)
     record = simulated(rng, intervals=31, measurements=6)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    whole = filters.run(name, record, BELIEF, initial, full_covariance=True)
-    some = filters.run(name, record, BELIEF, initial, every=7)
+    whole = estimation.run(record, BELIEF, initial, full_covariance=True)
+    some = estimation.run(record, BELIEF, initial, every=7)
     np.testing.assert_array_equal(some.time, record.time[::7])
     np.testing.assert_array_equal(some.attitude, whole.attitude[::7])
     np.testing.assert_array_equal(some.variance, whole.variance[::7])
@@ -352,9 +319,8 @@ def equivariant_rows(rows, R, z, r):
     return np.hstack([body_rows_midway(rows, R.T @ r, z) @ R.T, np.zeros((len(rows), 3))])
 
 
-@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("form", ["scalar", "covariance of each sample"])
-def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
+def test_a_missing_sample_is_as_if_it_were_not_there(form):
     """All kinds at the same times, edges among them, over uneven intervals and a gap: what is NaN is skipped and counted."""
     rng = np.random.default_rng(45)
     record = simulated(rng, intervals=20, kinds=tuple(REFERENCES), measurements=6, form=form, together=True)
@@ -377,7 +343,7 @@ def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
         lost.append(dataclasses.replace(series, **{content: value}))
         fewer.append(series.taken(np.delete(np.arange(6), [k, 5])))
     missing, removed = (
-        filters.run(name, dataclasses.replace(record, vectors=tuple(vectors)), BELIEF, initial, full_covariance=True)
+        estimation.run(dataclasses.replace(record, vectors=tuple(vectors)), BELIEF, initial, full_covariance=True)
         for vectors in (lost, fewer)
     )
     assert missing.skipped == dict.fromkeys(REFERENCES, 2)
@@ -395,7 +361,8 @@ def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
 
 @pytest.mark.parametrize(
     ("name", "kind", "form"),
-    [("package", *case) for case in CASES] + [(n, *case) for n in ("mekf", *comparison.EXTENDED) for case in OWN_CASES],
+    [("package", *case) for case in CASES]
+    + [(n, *case) for n in ("mekf", *comparison.EXTENDED) for case in SIMPLE_CASES],
 )
 def test_extended_filters_equal_a_slow_reference(name, kind, form):
     """Several steps from far off, corrections of a third of a radian, gyro intervals of half a radian."""
@@ -421,11 +388,11 @@ def test_extended_filters_equal_a_slow_reference(name, kind, form):
                 nis[record.vectors[i].sensor].append(slow.update(record.vectors[i], k))
         rows.append((slow.q, slow.b, slow.body_covariance()))
     if name == "package":
-        estimate = filters.run("mekf", record, noise, initial, full_covariance=True)
+        estimate = estimation.run(record, noise, initial, full_covariance=True)
         for sensor, values in nis.items():
             np.testing.assert_allclose(estimate.innovations[sensor].nis, values, rtol=1e-7)
     else:
-        estimate = own_filter(name, noise).run(record, initial)
+        estimate = comparison.own_filter(name, record, noise, initial).run(record, initial)
     for k, (q, b, P) in enumerate(rows):
         assert quaternion.angle_between(estimate.attitude[k], q) < 1e-9
         np.testing.assert_allclose(estimate.bias[k], b, rtol=0.0, atol=1e-9)
@@ -450,27 +417,12 @@ def test_gains_are_those_of_the_riccati_equation(sv, su, sigma, dt):
     P = solve_discrete_are((scale @ F @ S).T, (H @ S / sigma).T, scale @ Q @ scale.T, np.eye(1))
     P = S @ P @ S.T
     gain = P @ H.T / (P[0, 0] + sigma**2)
-    np.testing.assert_allclose(complementary.farrenkopf_gains(sv, su, sigma, dt), gain[:, 0], rtol=1e-8)
-
-
-def test_covariance_of_any_gain_is_josephs_form():
-    rng = np.random.default_rng(16)
-    M6 = rng.standard_normal((6, 6))
-    P = M6 @ M6.T
-    r = rng.standard_normal(3)
-    r /= np.linalg.norm(r)
-    across = np.eye(3) - np.outer(r, r)
-    root = rng.standard_normal((3, 3))
-    g, kappa = 0.3, -0.2
-    for M, V in ((across, 0.7 * across), (rng.standard_normal((3, 3)), root @ root.T)):
-        K = np.vstack([g * np.eye(3), kappa * np.eye(3)])
-        H = np.hstack([M, np.zeros((3, 3))])
-        wanted = (np.eye(6) - K @ H) @ P @ (np.eye(6) - K @ H).T + K @ V @ K.T
-        got = np.zeros((6, complementary_kernel.WIDTH_OF_ROW))
-        got[:, :6] = P
-        both = tuple(map(float, M.ravel())), tuple(map(float, V[np.triu_indices(3)]))
-        complementary_kernel.correct_covariance(got.reshape(-1), np.empty((2, 6, 6)), *both, g, kappa)
-        np.testing.assert_allclose(got[:, :6], wanted, rtol=1e-12, atol=1e-12)
+    time = np.arange(1.0, 101.0) * dt
+    r = REFERENCES["direction"]
+    record = resting(series_of("sun", "direction", time, np.tile(r, (100, 1)), r, sigma), time=(0.0, time[-1]))
+    noise = estimation.ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
+    start = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-12, bias_sigma=1e-15)
+    np.testing.assert_allclose(comparison.steady_gains(record, noise, start)["sun"], gain[:, 0], rtol=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["direction", "attitude"])
@@ -503,26 +455,11 @@ def test_complementary_filter_follows_the_paper_in_the_limit(kind):
             sensor="tracker", kind=kind, time=time[1:], attitude=np.tile(true, (n, 1)), sigma_axes=axes
         )
     record = ImuRecord(time=time, increments=np.tile(gyro * dt, (n, 1)), vectors=(series,))
-    gains = [[kp * dt], [-ki * dt]]
+    gains = {series.sensor: np.array([kp * dt, -ki * dt])}
     initial = estimation.initial_state(start, attitude_sigma=1.0, bias_sigma=0.1)
-    estimate = complementary.run(record, BELIEF, initial, gains=gains)
+    estimate = comparison.Mahony("mahony", BELIEF, gains).run(record, initial)
     assert quaternion.angle_between(estimate.attitude[-1], quaternion.normalize(wanted[:4])) < 1e-3
     np.testing.assert_allclose(estimate.bias[-1], wanted[4:], atol=1e-3)
-
-
-def test_each_sensor_has_its_own_gains():
-    """The order of the sensors is nothing but an order."""
-    rng = np.random.default_rng(49)
-    record = simulated(rng, intervals=30, kinds=("direction", "heading", "attitude"), measurements=8)
-    initial = started(record, rng, attitude_sigma=0.3, bias_sigma=1e-2)
-    attitude, bias = np.array([0.1, 0.3, 0.5]), np.array([-0.01, -0.05, -0.03])
-    estimates = []
-    for order in ([0, 1, 2], [2, 0, 1]):
-        gains = np.stack([attitude[order], bias[order]])
-        turned = dataclasses.replace(record, vectors=tuple(record.vectors[k] for k in order))
-        estimates.append(complementary.run(turned, BELIEF, initial, full_covariance=True, gains=gains))
-    for part in ("attitude", "bias", "covariance"):
-        np.testing.assert_array_equal(*(getattr(estimate, part) for estimate in estimates))
 
 
 def test_mahony_learns_a_constant_bias_with_its_default_gains():
@@ -536,56 +473,11 @@ def test_mahony_learns_a_constant_bias_with_its_default_gains():
     record = ImuRecord(time=time, increments=np.tile(bias / 10.0, (n, 1)), vectors=vectors)
     initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.01, bias_sigma=0.01)
     noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
-    off = np.linalg.norm(filters.run("mahony", record, noise, initial).bias - bias, axis=1) / np.linalg.norm(bias)
+    estimate = comparison.estimated("mahony", record, noise, initial)
+    off = np.linalg.norm(estimate.bias - bias, axis=1) / np.linalg.norm(bias)
     assert off[0] == 1.0
     assert 0.0 < off[n // 10] < 0.5
     assert off[-1] < 1e-3
-
-
-@pytest.mark.parametrize(("kind", "form"), SHARPEST)
-def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
-    """``ω_mes = M δθ + n``: M by differences of the truth, Cov n by differences of the measurement."""
-    rng = np.random.default_rng([46, list(REFERENCES).index(kind)])
-    (series,) = simulated(rng, intervals=5, kinds=(kind,), measurements=1, sigma=1e-13).vectors
-    root = 0.01 * TILTED
-    N = root @ root.T
-    noise = tuple(map(float, N[np.triu_indices(3)]))
-    z, r = series.vector_b[0], series.references_f[0] if kind != "attitude" else None
-    q0 = series.attitude[0] if kind == "attitude" else Rotation.align_vectors(
-        [r if kind != "heading" else [*r[:2], 0.4]], [z]
-    )[0].as_quat(scalar_first=True)  # fmt: skip
-    frame = np.zeros(9)
-
-    def turned(q, e):
-        R = quaternion.to_matrix(q)
-        vector, h, y = z, np.zeros(3), 0.0
-        if kind == "attitude":
-            frame[:4] = quaternion.multiply(q0, quaternion.exp(e))
-            vector = np.zeros(3)
-        else:
-            size = np.linalg.norm(r)
-            frame[:] = triad(r / size).ravel()
-            vector = z / size + (e if kind != "heading" else 0.0)
-        code = {"direction": 0, "vector": 1, "heading": 2, "attitude": 3}[kind]
-        if kind == "heading":
-            h, y = (
-                measurement.heading_row(tuple(R.ravel()), tuple(z)),
-                measurement.heading_error(R.ravel(), z, r) + e[0],
-            )
-        return complementary_kernel.measured_turn(
-            code, tuple(q), tuple(R.ravel()), tuple(vector), tuple(frame), noise, tuple(h), y
-        )
-
-    M = derivative(
-        lambda d: np.array([turned(q, np.zeros(3))[0] for q in quaternion.multiply(q0, quaternion.exp(-d))]), 3
-    )
-    K = derivative(lambda e: np.array([turned(q0, error)[0] for error in e]), 3)
-    turn, M_reported, V = turned(q0, np.zeros(3))
-    np.testing.assert_allclose(turn, 0.0, atol=1e-11)
-    np.testing.assert_allclose(np.reshape(M_reported, (3, 3)), M, atol=1e-9)
-    if kind == "heading":
-        N = np.diag([N[0, 0], 0.0, 0.0])
-    np.testing.assert_allclose(np.reshape(mekf_full(V), (3, 3)), K @ N @ K.T, atol=1e-12)
 
 
 # ----------------------------------------------------------------------------------------------------------------- truth
@@ -622,11 +514,11 @@ def anees(name, kind, form, runs, factor):
     return Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, probability=0.999)
 
 
-EVERY_CASE = [(name, *case) for name in filters.FILTERS for case in CASES]
-EVERY_CASE += [(name, *case) for name in (*comparison.EXTENDED, "usque") for case in OWN_CASES]
+EVERY_CASE = [("mekf", *case) for case in CASES] + [(n, *case) for n in comparison.NAMES[1:] for case in SIMPLE_CASES]
+SHARP_CASES = [("mekf", *case) for case in SHARPEST] + [("mahony", *case) for case in SIMPLE_CASES]
 
 
-@pytest.mark.parametrize(("name", "kind", "form"), [(name, *case) for name in filters.FILTERS for case in SHARPEST])
+@pytest.mark.parametrize(("name", "kind", "form"), SHARP_CASES)
 def test_consistent_for_every_kind(name, kind, form):
     """ANEES inside its two-sided bounds (99.9 % each); above them when the noise is modelled at a third of what it is."""
     right, doubted = (anees(name, kind, form, 25, factor) for factor in (1.0, 1.0 / 3.0))
@@ -639,24 +531,24 @@ def test_consistent_for_every_kind(name, kind, form):
 @pytest.mark.parametrize(("name", "kind", "form"), EVERY_CASE)
 def test_consistent_for_every_kind_and_noise_in_many_runs(name, kind, form):
     """The same over more runs; noise that is modelled too large shows too, below the bounds."""
-    runs = 400 if name in filters.FILTERS else 100
+    runs = 400 if name == "mekf" else 100
     assert anees(name, kind, form, runs, 1.0).consistent
     low = anees(name, kind, form, runs, 0.5)
     assert not low.consistent
     assert np.max(low.mean) > 1.0
-    if name in filters.FILTERS:  # the others would take too many runs
+    if name == "mekf":  # the others would take too many runs
         high = anees(name, kind, form, runs, 3.0)
         assert not high.consistent
         assert np.min(high.mean) < 1.0
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in filters.FILTERS else pytest.mark.slow) for name in comparison.NAMES]
+    "name", ["mekf", *(pytest.param(name, marks=pytest.mark.slow) for name in (*comparison.EXTENDED, "usque"))]
 )
 @pytest.mark.parametrize(("degrees", "left"), [(60.0, 0.5), (120.0, 3.0)])
 def test_converges_from_large_errors(name, degrees, left):
     rng = np.random.default_rng(20)
-    kinds = ("direction", "vector" if name in filters.FILTERS else "attitude")
+    kinds = ("direction", "vector" if name == "mekf" else "attitude")
     record = simulated(rng, intervals=600, kinds=kinds, measurements=150, bias=1e-3)
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
@@ -674,9 +566,8 @@ def test_converges_from_large_errors(name, degrees, left):
 # ------------------------------------------------------------------------------------------------------------- wild starts
 
 
-@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("angle", [1e-6, 0.2, 0.5, 2.0, np.pi, 9.0])
-def test_propagation_over_any_turn_is_that_of_its_linear_system(angle, name):
+def test_propagation_over_any_turn_is_that_of_its_linear_system(angle):
     """Φ and Q of one long interval against Van Loan's discretisation of δθ̇ = −[ω] δθ − δb, q against SciPy's rotations.
 
     Beyond a third of a radian in sub-steps; where the gyro is at rest and the bias turns the body, too.
@@ -691,7 +582,7 @@ def test_propagation_over_any_turn_is_that_of_its_linear_system(angle, name):
     for b in (rng.standard_normal(3), -phi / dt):
         initial = estimation.State(attitude=quaternion.exp(rng.standard_normal(3)), bias=b, covariance=M @ M.T)
         record = ImuRecord(time=[0.0, dt], increments=[phi + b * dt], vectors=())
-        estimate = filters.run(name, record, noise, initial, full_covariance=True)
+        estimate = estimation.run(record, noise, initial, full_covariance=True)
         np.testing.assert_allclose(
             estimate.covariance[1], transition @ (M @ M.T) @ transition.T + Q, rtol=0.0, atol=1e-11
         )
@@ -755,11 +646,10 @@ def assert_sound(estimate):
 
 
 @pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["few", "thousands"])
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_every_filter_stays_finite_from_any_start(name, many):
+def test_the_filter_stays_finite_from_any_start(many):
     for seed in range(100, 3000) if many else range(16):
         record, initial = wild(seed, 2000 if many else 300)
-        assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
+        assert_sound(estimation.run(record, BELIEF, initial, full_covariance=True))
 
 
 @pytest.mark.parametrize(
@@ -769,7 +659,7 @@ def test_every_filter_stays_finite_from_any_start(name, many):
         for case in CASES
     ],
 )
-def test_every_filter_stays_finite_whatever_it_measures(kind, form):
+def test_the_filter_stays_finite_whatever_it_measures(kind, form):
     rng = np.random.default_rng([48, CASES.index((kind, form))])
     for together in (False, True):
         record = simulated(
@@ -783,45 +673,46 @@ def test_every_filter_stays_finite_whatever_it_measures(kind, form):
             together=together,
         )
         initial = begun_off(record, rng.standard_normal(3), 3.1, rng)
-        for name in filters.FILTERS:
-            assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
+        assert_sound(estimation.run(record, BELIEF, initial, full_covariance=True))
 
 
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_a_heading_seen_straight_up_says_nothing(name):
+def test_a_heading_seen_straight_up_says_nothing():
     """The start takes the measured vector to the vertical exactly: it has no heading, and the filter waits for the next."""
     series = series_of("compass", "heading", [0.5], [[0.0, 0.0, 1.0]], [1.0, 0.0, 0.0], 0.1)
     record = resting(series)
     initial = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=0.1)
-    estimate = filters.run(name, record, BELIEF, initial, full_covariance=True)
+    estimate = estimation.run(record, BELIEF, initial, full_covariance=True)
     assert_sound(estimate)
     assert (estimate.skipped, len(estimate.innovations["compass"].time)) == ({"compass": 1}, 0)
-    if name == "mekf":
-        np.testing.assert_allclose(estimate.attitude[-1], initial.attitude, atol=1e-15)
-        assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
+    np.testing.assert_allclose(estimate.attitude[-1], initial.attitude, atol=1e-15)
+    assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
 
 
 def test_comparing_all_is_one_line_with_a_table():
     rng = np.random.default_rng(47)
     record = simulated(rng, intervals=40, kinds=("direction", "attitude"), measurements=20)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    compared = filters.compare(record, BELIEF, initial, every=2)
-    assert list(compared.estimates) == list(filters.FILTERS)
+    mine = comparison.own_filter("mahony", record, BELIEF, initial)
+    compared = filters.compare(record, BELIEF, initial, filters=["mekf", mine], every=2)
+    assert list(compared.estimates) == ["mekf", "mahony"]
+    own = mine.run(record, initial)
     late = compared.estimates["mekf"].time >= 0.5 * record.time[-1]
     for name, estimate in compared.estimates.items():
-        np.testing.assert_array_equal(estimate.attitude, filters.run(name, record, BELIEF, initial, every=2).attitude)
+        wanted = own.attitude[::2] if name == "mahony" else estimation.run(record, BELIEF, initial, every=2).attitude
+        np.testing.assert_array_equal(estimate.attitude, wanted)
         error = errors(estimate, record.truth, 2)[late]
         row = compared.summary()[name]
         np.testing.assert_allclose(row["attitude_error"] ** 2, np.mean(error[:, :3] ** 2), rtol=1e-10)
         np.testing.assert_allclose(row["bias_error"] ** 2, np.mean(error[:, 3:] ** 2), rtol=1e-10)
         np.testing.assert_allclose(row["attitude_sigma"] ** 2, np.mean(estimate.variance[late, :3]), rtol=1e-12)
         np.testing.assert_allclose(row["bias_sigma"] ** 2, np.mean(estimate.variance[late, 3:]), rtol=1e-12)
-        parts = [i.whitened[i.time >= estimate.time[late][0]].ravel() for i in estimate.innovations.values()]
-        np.testing.assert_allclose(row["nis"], np.mean(np.concatenate(parts) ** 2), rtol=1e-12)
-        assert row["degrees"] == len(np.concatenate(parts))
+    estimate, row = compared.estimates["mekf"], compared.summary()["mekf"]
+    parts = [i.whitened[i.time >= estimate.time[late][0]].ravel() for i in estimate.innovations.values()]
+    np.testing.assert_allclose(row["nis"], np.mean(np.concatenate(parts) ** 2), rtol=1e-12)
+    assert row["degrees"] == len(np.concatenate(parts))
     assert f"{compared.summary()['mekf']['attitude_error'] / DEGREE:.4g}" in str(compared)
     # Without truth it reports differences from the first filter.
-    blind = filters.compare(dataclasses.replace(record, truth=None), BELIEF, initial, filters=["mahony", "mekf"])
+    blind = filters.compare(dataclasses.replace(record, truth=None), BELIEF, initial, filters=[mine, "mekf"])
     assert "from mahony" in str(blind)
     assert 0.0 < blind.summary()["mekf"]["attitude_error"] < 0.1
     silent = filters.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")

@@ -29,7 +29,6 @@ from strapdown.estimation.model import assemble
 from strapdown.kernels import (
     algebra,
     analysis,
-    complementary,
     gate,
     likelihood,
     likelihood_outliers,
@@ -213,7 +212,6 @@ BODIES = [
     (montecarlo_run, montecarlo_six),
     (likelihood, OWN),
     (likelihood_outliers, likelihood, OWN),
-    (complementary, FILTER),
 ]
 """What the walk is compiled with."""
 
@@ -239,7 +237,6 @@ def test_every_body_of_the_walk_is_listed_here():
         ("montecarlo_run", "*prepared.parts"),
         ("kernels",),
         ("*bodies",),
-        ("complementary", "kernels"),
     }
 
 

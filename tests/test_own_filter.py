@@ -278,18 +278,6 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     assert "textbook" not in campaigns.report(path)[0]
 
 
-def test_the_packages_other_filter_runs_in_a_monte_carlo_by_name():
-    name = "mahony"
-
-    def by_hand(record, initial):
-        return filters.run(name, record, SETUP.process_noise, initial, full_covariance=True)
-
-    same(montecarlo.run_plan(with_filter(name), runs=3), montecarlo.run_plan(with_filter(by_hand), runs=3))
-    filter_setup = replace(SETUP, estimator=name)
-    assert setup.from_toml(setup.to_toml(filter_setup)) == filter_setup != SETUP
-    assert "estimator" not in setup.to_table(SETUP)
-
-
 def test_it_is_compared_with_the_packages_filters():
     record = montecarlo.replay(PLAN, 0, machine="scalar")
     table = filters.compare(

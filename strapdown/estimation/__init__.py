@@ -15,7 +15,7 @@ tangent space.
 - ``live``: The compiled filter for data in real time.
 - ``step_filter``: The filter in single steps, on filterpy.
 - ``multiple_model``: Unknown initial attitude, by multiple-model estimation.
-- ``filters``: Other filters with the same interface, for comparison.
+- ``filters``: Filters of your own, and their comparison.
 - ``setup``: The setup of a filter, matched to a scenario or read from a file, and the filter of a setup over a record.
 """
 

@@ -39,7 +39,6 @@ from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import gate, gate_rules, iterated_update, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
 from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
@@ -591,23 +590,6 @@ def aligned_zeros(*shape: int) -> Array:
     numbers = np.zeros(math.prod(shape) + WIDTH - 1)
     first = -(numbers.ctypes.data // numbers.itemsize) % WIDTH
     return numbers[first : first + math.prod(shape)].reshape(shape)
-
-
-ANY_SENSOR = modelling.assemble((), {kind: kind for kind in KIND_CODES}, isotropic=False)
-"""Model of attitude and gyro bias with sensors of every kind, by code: one compilation serves all records."""
-
-
-def with_any_sensor(problem: Problem) -> Problem:
-    """Return a problem without error states with the model :data:`ANY_SENSOR`."""
-    return replace(problem, model=replace(ANY_SENSOR, shape=problem.events.codes.astype(np.int64)))
-
-
-def measurements_in_body_axes(events: Schedule, first: int = 0) -> Measurements:
-    """Return the measurements from number ``first`` on, in order of time, for :data:`ANY_SENSOR`: with covariances in body axes."""
-    columns = {name: getattr(events.measurements, name)[first:] for name in ("time", "place", "sensor")}
-    noise = np.empty((len(events.time), 6))
-    noise[events.row] = events.body_noise
-    return events.measurements._replace(noise=read_only(noise), **columns)
 
 
 def segment_width(model: Model) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown import coning, units
 from strapdown.checks import Hint, InputError, instance, one_of, positive
-from strapdown.estimation import filters
+from strapdown.estimation.filters import MEKF
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import matching
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 MIN_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error for a gyro whose specification has no bias, rad/s."""
-MEKF = "mekf"
-"""Name of the package's own filter; other estimators can be run over records and compared."""
 
 Sigma = float | tuple[float, float, float]
 """σ of a sensor: one number, or one about (for whole vectors along) each body axis x, y, z."""
@@ -69,7 +67,7 @@ class FilterSetup(ByValue):
     states : States, optional
         Error states in addition to attitude and bias. Default: none. If they include drifts, so does the estimated bias.
     estimator : str, Own, filter or callable, default MEKF
-        Filter that processes a record: a name of :data:`strapdown.estimation.filters.FILTERS`, or a filter of your own
+        Filter that processes a record: the package's, or a filter of your own
         (:mod:`strapdown.estimation.filters.own`), which starts with the two σ above and does not use ``process_noise``.
     """
 
@@ -96,7 +94,7 @@ class FilterSetup(ByValue):
         sigma = {str(name): sensor_sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
         object.__setattr__(self, "sigma", sigma)
         if isinstance(self.estimator, str):
-            one_of("estimator", self.estimator, filters.FILTERS)
+            one_of("estimator", self.estimator, (MEKF,))
         else:
             object.__setattr__(self, "estimator", as_own(self.estimator))
         if self.estimator != MEKF and (self.gate, self.robust, self.states) != (None, None, None):

@@ -9,13 +9,13 @@ import numpy as np
 
 from strapdown import estimation, quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.estimation import Observability, filters, forward
+from strapdown.estimation import Observability, forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.schedule import schedule
-from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
+from strapdown.estimation.setup.filter_setup import FilterSetup, need_mekf
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
 from strapdown.randomness import generator
@@ -114,8 +114,8 @@ def run_modelled(
     **options: Any,
 ) -> Estimate:
     """Run the filter of a setup over a :func:`modelled_record`, with its :func:`measured_motion` if known."""
-    if setup.estimator != MEKF:
-        return _run_other(record, setup, initial, **options)
+    if isinstance(setup.estimator, Own):
+        return _run_own(setup.estimator, record, initial, **options)
     judging = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is None:
         return estimation.run(record, setup.process_noise, initial, **judging)
@@ -137,14 +137,8 @@ def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array
     return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
 
 
-def _run_other(
-    record: ImuRecord, setup: FilterSetup, initial: State, *, every: int = 1, full_covariance: bool = False
-) -> Estimate:
-    if isinstance(setup.estimator, Own):
-        return setup.estimator(record, initial, times=None if every == 1 else record.time[::every])
-    return filters.run(
-        setup.estimator_name, record, setup.process_noise, initial, every=every, full_covariance=full_covariance
-    )
+def _run_own(own: Own, record: ImuRecord, initial: State, *, every: int = 1, full_covariance: bool = False) -> Estimate:
+    return own(record, initial, times=None if every == 1 else record.time[::every])
 
 
 def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
