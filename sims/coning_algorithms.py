@@ -151,7 +151,7 @@ def exact_step(table: Algorithm, window: Sequence[Vector]) -> Vector:
     if table.solver == "polynomial":
         q = polynomial_step(powers, n)
         return multiply(q, exponential(pair_sum(table.correction, window))) if any(map(any, table.correction)) else q
-    return runge_kutta_step(powers, n) if table.solver == "runge-kutta-4" else moment_step(table.solver, powers, n)
+    return runge_kutta_step(powers, n) if table.solver == "runge-kutta-4" else magnus_step(powers, n)
 
 
 def unit(q: Vector) -> Vector:
@@ -179,14 +179,9 @@ def runge_kutta_step(powers: Sequence[Vector], samples: int) -> Vector:
     return unit(tuple(o + (a + 2 * b + 2 * c + d) / 6 for o, a, b, c, d in zip(identity, k1, k2, k3, k4, strict=True)))
 
 
-def moment_step(solver: str, powers: Sequence[Vector], samples: int) -> Vector:
-    """Return the Magnus or commutator-free step from the moments B_i = T⁻ⁱ ∫ (t − T/2)ⁱ w dt."""
+def magnus_step(powers: Sequence[Vector], samples: int) -> Vector:
+    """Return the sixth-order Magnus step from the moments B_i = T⁻ⁱ ∫ (t − T/2)ⁱ w dt."""
     b0, b1, b2 = (combination(moment_weights(samples, i, mp.mp.dps), powers) for i in range(3))
-    if solver == "magnus-4":
-        return exponential(combination([1, 1], [b0, cross(b0, b1)]))
-    if solver == "commutator-free-4":
-        half = mp.mpf(1) / 2
-        return multiply(exponential(combination([half, -2], [b0, b1])), exponential(combination([half, 2], [b0, b1])))
     a1 = combination([mp.mpf(9) / 4, -15], [b0, b2])
     a2 = combination([12], [b1])
     a3 = combination([-15, 180], [b0, b2])

@@ -559,9 +559,7 @@ def windows():
             name=f"pairs-{n}-{p}-{f}", solver="pairs", samples=n, previous=p, following=f, order=3, pairs=taylor
         )
         yield coning.algorithms.matched(n, p, f)
-    yield from (
-        ALGORITHMS[name] for name in ("magnus-4", "magnus-6", "commutator-free-4", "runge-kutta-4", "quaternion-euler")
-    )
+    yield from (ALGORITHMS[name] for name in ("magnus-6", "runge-kutta-4", "quaternion-euler"))
 
 
 def test_no_kernel_reads_or_writes_outside_its_arrays(monkeypatch):

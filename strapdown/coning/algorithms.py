@@ -22,9 +22,7 @@ SOLVERS = {
     "compressed": "rotation vector with one cross product",
     "pairs": "rotation vector with all cross products",
     "polynomial": "quaternion equation solved to rounding on the rate polynomial",
-    "magnus-4": "one exponential of two moments",
     "magnus-6": "one exponential of three moments",
-    "commutator-free-4": "two exponentials of two moments",
     "runge-kutta-4": "classical Runge–Kutta on the quaternion",
     "euler": "first-order update of the quaternion, normalised",
 }
@@ -443,12 +441,10 @@ def _scheme_products(solver: str, samples: int) -> Table:
         w = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
         both = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
         return tuple(tuple(x / 12 for x in row) for row in both)
+    # magnus-6: α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
     b = exact.step_moments(samples, 3)
-    if solver == "magnus-6":
-        # α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
-        left = tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True))
-        return exact.outer_pairs(left, tuple(12 * y for y in b[1]))
-    return exact.outer_pairs(b[0], b[1])
+    left = tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True))
+    return exact.outer_pairs(left, tuple(12 * y for y in b[1]))
 
 
 # ------------------------------------------------------------------------------------------------------------------- makers
@@ -524,10 +520,7 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
 
 _SCHEMES: dict[str, dict[str, Any]] = {
     # From moments of the polynomial.
-    "magnus-4": {"solver": "magnus-4", "samples": 3, "order": 4, "source": "Blanes, Casas, Ros 2000"},
     "magnus-6": {"solver": "magnus-6", "samples": 4, "order": 6, "source": "Blanes, Casas, Ros 2000"},
-    # exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁).
-    "commutator-free-4": {"solver": "commutator-free-4", "samples": 3, "order": 4, "source": "Blanes, Moan 2006"},
     # From equation (17), with rates at 0, T/2, T.
     "runge-kutta-4": {"solver": "runge-kutta-4", "samples": 3, "order": 4, "source": "Kutta 1901"},
     # q + ½ q ⊗ Δθ, normalised, as in many small projects.

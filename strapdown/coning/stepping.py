@@ -322,9 +322,7 @@ def _fits(window: int) -> Array:
 @functools.cache
 def _scheme(solver: str, samples: int) -> tuple[Array, int]:
     numbers = {
-        "magnus-4": kernels.MAGNUS_4,
         "magnus-6": kernels.MAGNUS_6,
-        "commutator-free-4": kernels.COMMUTATOR_FREE_4,
         "runge-kutta-4": kernels.RUNGE_KUTTA_4,
         "euler": kernels.EULER,
     }

@@ -1,4 +1,4 @@
-"""Solution of q̇ = ½ q ⊗ w for a rate polynomial: to rounding by a power series, or by Magnus, commutator-free, Runge–Kutta, Euler."""
+"""Solution of q̇ = ½ q ⊗ w for a rate polynomial: to rounding by a power series, or by Magnus, Runge–Kutta, Euler."""
 
 from __future__ import annotations
 
@@ -29,11 +29,9 @@ TERMS_PER_SAMPLE = 2
 EXTRA_TERMS = 24
 """At a constant rate of ``LARGEST_RATE`` the terms decrease as 1/n!, to below rounding at n = 18."""
 
-MAGNUS_4 = 0
-MAGNUS_6 = 1
-COMMUTATOR_FREE_4 = 2
-RUNGE_KUTTA_4 = 3
-EULER = 4
+MAGNUS_6 = 0
+RUNGE_KUTTA_4 = 1
+EULER = 2
 
 
 def quaternion_times_vector(q, v):
@@ -155,13 +153,11 @@ def polynomial_steps(increments, samples, previous, fits, correction, rates, ser
         store_row(steps, k, renormalized(q))
 
 
-def magnus_4(b0, b1):
-    """Return exp(B₀ + B₀ × B₁), B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt."""
-    return large_exponential(add(b0, cross(b0, b1)))
-
-
 def magnus_6(b0, b1, b2):
-    """Return the sixth-order Magnus step (Blanes, Casas, Ros 2000), with [a, b] = −a × b because equation (17) multiplies on the right."""
+    """Return the sixth-order Magnus step (Blanes, Casas, Ros 2000) from the moments B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt.
+
+    [a, b] = −a × b because equation (17) multiplies on the right.
+    """
     a1 = combine(2.25, b0, -15.0, b2)
     a2 = (12.0 * b1[0], 12.0 * b1[1], 12.0 * b1[2])
     a3 = combine(-15.0, b0, 180.0, b2)
@@ -170,13 +166,6 @@ def magnus_6(b0, b1, b2):
     left = (-20.0 * a1[0] - a3[0] + c1[0], -20.0 * a1[1] - a3[1] + c1[1], -20.0 * a1[2] - a3[2] + c1[2])
     return large_exponential(
         add(combine(1.0, a1, 1.0 / 12.0, a3), combine(1.0 / 240.0, cross(add(a2, c2), left), 0.0, a1))
-    )
-
-
-def commutator_free_4(b0, b1):
-    """Return exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁)."""
-    return quaternion_multiply(
-        large_exponential(combine(0.5, b0, -2.0, b1)), large_exponential(combine(0.5, b0, 2.0, b1))
     )
 
 
@@ -219,12 +208,8 @@ def scheme_steps(increments, weights, scheme, steps):
         a = weighted(increments, first, weights, 0)
         b = weighted(increments, first, weights, 1)
         c = weighted(increments, first, weights, 2)
-        if scheme == MAGNUS_4:
-            q = magnus_4(a, b)
-        elif scheme == MAGNUS_6:
+        if scheme == MAGNUS_6:
             q = magnus_6(a, b, c)
-        elif scheme == COMMUTATOR_FREE_4:
-            q = commutator_free_4(a, b)
         elif scheme == RUNGE_KUTTA_4:
             q = runge_kutta_4(a, b, c)
         else:
