@@ -264,8 +264,7 @@ def _at_stamps(
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = (np.empty((n, width)) for width in (4, 3, 6))
     P = np.empty((n if options.full_covariance else 0, 6, 6))
-    late = np.broadcast_to(delays.gyro, used.time.shape)
-    ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
+    ahead = -sensor_delays.turn_over(used, -delays.gyro) if options.smooth else used.rate * delays.gyro
     interval = max(parameters.step, used.interval)
     scales = regions.scales(filtered, parameters, interval, causal=not options.smooth)
     level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
@@ -279,7 +278,13 @@ def _at_stamps(
     at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, *scales, iron)
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),
-        recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),
+        recording_steps.Stamps(
+            time=read_only(used.time),
+            rate=read_only(used.rate),
+            turned=read_only(prepared.turned),
+            late=delays.gyro,
+            ahead=read_only(ahead),
+        ),
         regions.limits(parameters, delays.sigma),
         recording_steps.Carried(attitude, bias, variance, P),
     )

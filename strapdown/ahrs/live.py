@@ -145,7 +145,7 @@ class LiveAhrs:
         estimate = [np.ones(shape) for shape in ((1, 4), (1, 3), (1, 6), (1, 6, 6))]
         r = read_only
         at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
-        stamps = Stamps(*map(r, (a.times, a.rates, a.turns, np.full(2, late), a.ahead)))
+        stamps = Stamps(r(a.times), r(a.rates), r(a.turns), late, r(a.ahead))
         of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
         heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
         at_rest = starting.kernel.Means(a.found_rate, a.found_rest)

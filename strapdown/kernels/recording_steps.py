@@ -161,8 +161,8 @@ class Stamps(NamedTuple):
     rate: np.ndarray
     turned: np.ndarray
     """Attitude from the gyro only (n, 4)."""
-    late: np.ndarray
-    """Delay of the stamp relative to the motion (n,), s."""
+    late: float
+    """Delay of the stamps relative to the motion, s."""
     ahead: np.ndarray
     """Rotation vector (n, 3) over that delay, from the gyro."""
 
@@ -236,7 +236,7 @@ def carry_to_stamps(steps, stamps, limits, out):
         first_row, second_row = across[:3], across[3:6]
         across = combine(sx, first_row, sm, second_row) + combine(sm, first_row, sy, second_row) + scale(h, across[6:])
         for n in range(first, last):
-            late = stamps.time[n] - stamps.time[first] + stamps.late[n]
+            late = stamps.time[n] - stamps.time[first] + stamps.late
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
             q, _ = moved(quaternion_multiply(since, quaternion_at(t, n)), v)
             q = renormalized(q)

@@ -21,8 +21,6 @@ PAIRS_IN_SPAN = 12
 """Number of pairs of field samples per span; more are not independent."""
 MAX_DELAY_SIGMA = 2e-3
 """Maximum σ of a delay of the magnetometer that is used, s."""
-MAX_DELAY = 0.05
-"""Maximum delay of the magnetometer that is used, s; a larger value has another cause than a delay."""
 ASSUMED_SIGMA = 2e-3
 """σ of an assumed gyro delay, s."""
 GIVEN_SIGMA = 3e-4
@@ -33,8 +31,8 @@ GIVEN_SIGMA = 3e-4
 class Delays:
     """Delays of a recording's sensors."""
 
-    gyro: Array | float
-    """Delay of the stamps of gyro and accelerometer relative to the motion, s: one number, or one per sample (n,)."""
+    gyro: float
+    """Delay of the stamps of gyro and accelerometer relative to the motion, s."""
     sigma: float
     """Standard deviation of that delay, s."""
     field: Array | float
@@ -47,7 +45,7 @@ class Delays:
     @property
     def words(self) -> tuple[str, ...]:
         """Description of the delays."""
-        late, field = 1e3 * self.last_gyro, 1e3 * self.last_field
+        late, field = 1e3 * self.gyro, 1e3 * self.last_field
         sentences = [
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.is_specified
@@ -60,11 +58,6 @@ class Delays:
                 f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms, compensated."
             )
         return tuple(sentences)
-
-    @property
-    def last_gyro(self) -> float:
-        """Delay of the gyro at the end, s."""
-        return float(np.ravel(self.gyro)[-1])
 
     @property
     def last_field(self) -> float:
@@ -83,9 +76,9 @@ def find(
     """Return the delays of a recording's sensors.
 
     ``latency`` is the delay of gyro and accelerometer, s, if known. The default is half a sample interval, as for means over the interval
-    before the stamp, or if longer, the time by which the magnetometer is ahead of the gyro, because no sensor can precede the motion.
-    ``field`` is the delay of the magnetometer relative to the gyro, s, if known. ``causal``: each sample's delay is computed from the
-    samples before it, and updated whenever the duration has doubled. ``turned`` (n, 4): attitude from the gyro only, if already computed.
+    before the stamp. ``field`` is the delay of the magnetometer relative to the gyro, s, if known. ``causal``: each sample's delay is
+    computed from the samples before it, and updated whenever the duration has doubled. ``turned`` (n, 4): attitude from the gyro only, if
+    already computed.
     """
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
@@ -100,13 +93,11 @@ def find(
         for span in spans:
             until = np.searchsorted(evidence[0], recording.time[0] + span, side="right")
             delay, sigma = _fitted(*(part[:until] for part in evidence[1:]))
-            if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
+            if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay):
                 since = recording.time[0] + span if causal else recording.time[0]
                 field_delay[np.searchsorted(recording.time, since) :] = delay
-    half = 0.5 * recording.interval
-    gyro: Array | float = np.maximum(half, -field_delay) if latency is None else latency
     return Delays(
-        gyro=gyro,
+        gyro=0.5 * recording.interval if latency is None else latency,
         sigma=ASSUMED_SIGMA if latency is None else GIVEN_SIGMA,
         field=field_delay,
         field_sigma=sigma,

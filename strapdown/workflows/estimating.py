@@ -306,7 +306,7 @@ def _run_recording(
                 f"parameter.{parameter.name}": getattr(parameters, parameter.name)
                 for parameter in dataclasses.fields(parameters)
             },
-            "latency": result.delays.last_gyro,
+            "latency": result.delays.gyro,
             "magnetometer_latency": result.delays.last_field,
         },
     )
