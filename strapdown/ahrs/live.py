@@ -111,75 +111,24 @@ class LiveAhrs:
             sensors=self._sensors,
         )
         self._sample = np.zeros(10)
-        self._imu = self._arrays(late, ASSUMED_SIGMA if latency is None else GIVEN_SIGMA)
+        self._imu = self._kernel_input(late, ASSUMED_SIGMA if latency is None else GIVEN_SIGMA)
         self._call: Any = self._sample.data
         self._table = packed(self._imu)
         dispatcher = compiled(kernel.take)
         self._kind = dispatcher.typeof_pyval(self._imu)
         self._take = dispatcher.compile(tuple(map(dispatcher.typeof_pyval, (self._kind, self._table, 0))))
 
-    def _arrays(self, late: float, delay_sigma: float) -> kernel.Imu:
-        """Return the kernel's arrays."""
-        parameters, magnetometer = self.parameters, self.magnetometer
-        most = MAX_SAMPLES_RATIO * max(1, math.ceil(parameters.step / self.interval)) + 2
-        table = kernel.LASTING | kernel.PASSING
-        a: Any = kernel.Arrays(
-            **{
-                name: np.zeros([most if n == kernel.MOST else n for n in shape], np.int64 if kind == "int" else float)
-                for name, (shape, kind, _) in table.items()
-            }
-        )
-        step = max(parameters.step, self.interval)
-        intervals = step, parameters.heading_interval
-        a.force_density[0], a.field_density[0] = (
-            regions.FIRST_DENSITY[0],
-            regions.FIRST_DENSITY[0] if magnetometer else 1.0,
-        )
-        a.force_averages[:], a.field_averages[:] = map(regions.first_memory, (2, 1), intervals)
-        of_force, of_field = map(regions.averages, intervals)
+    def _kernel_input(self, late: float, delay_sigma: float) -> kernel.Imu:
+        """Return the kernel's input before the first sample."""
+        parameters, step = self.parameters, max(self.parameters.step, self.interval)
         constants = headings.constants_of(parameters, step)
         self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
         self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
-        time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
-        estimate = [np.ones(shape) for shape in ((1, 4), (1, 3), (1, 6), (1, 6, 6))]
-        r = read_only
-        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
-        stamps = Stamps(r(a.times), r(a.rates), r(a.turns), late, r(a.ahead))
-        of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
-        heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
-        at_rest = starting.kernel.Means(a.found_rate, a.found_rest)
-        arguments = kernel.Routines(
-            follow=(r(a.times), r(a.rates), a.turns),
-            average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
-            end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
-            judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
-            scale=(
-                r(a.force_density),
-                r(a.field_density),
-                regions.scales_of(parameters, magnetometer=magnetometer),
-                a.tilt,
-                a.heading,
-            ),
-            carry=(at_step, stamps, regions.limits(parameters, delay_sigma), self._found),
-            average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
-            head=(constants, headings.kernel.Steps(*map(r, of_step)), self._memory, headings.kernel.Outputs(*heading)),
-            judge_field=(r(a.field_innovation), of_field, a.field_averages, a.field_density),
-            watch=(
-                starting.constants_of(self.interval, parameters),
-                *map(r, (time, gyro, force, field if magnetometer else field[:0])),
-                self._rests,
-                at_rest,
-            ),
-        )
-        routines = (
-            kernel.Routine(address_of(compiled(function), values), values)
-            for function, values in zip(kernel.KERNELS, arguments, strict=True)
-        )
-        attitude, bias, variance, covariance = estimate
-        return kernel.Imu(
+        time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
+        imu = kernel.Imu(
             filter=live,
-            magnetometer=int(magnetometer),
+            magnetometer=int(self.magnetometer),
             rests=int(parameters.rest_bias_sigma > 0.0),
             interval=self.interval,
             step=parameters.step,
@@ -190,18 +139,63 @@ class LiveAhrs:
             gyro=gyro,
             accelerometer=force,
             magnetic=field,
-            arrays=a,
+            arrays=self._first_arrays(step),
             resting=self._rests.resting,
             first=self._memory.start,
-            routines=kernel.Routines(*routines),
+            routines=kernel.KERNELS,
             state=state,
             numbers=numbers,
             places=places,
             refused=np.zeros(1, np.int64),
-            attitude=attitude,
-            bias=bias,
-            variance=variance,
-            covariance=covariance,
+            attitude=np.ones((1, 4)),
+            bias=np.ones((1, 3)),
+            variance=np.ones((1, 6)),
+            covariance=np.ones((1, 6, 6)),
+        )
+        routines = (
+            kernel.Routine(address_of(compiled(function), values), values)
+            for function, values in zip(kernel.KERNELS, self._arguments(imu, constants, delay_sigma), strict=True)
+        )
+        return imu._replace(routines=kernel.Routines(*routines))
+
+    def _first_arrays(self, step: float) -> Any:
+        """Return the arrays of the samples before the first one."""
+        parameters, magnetometer = self.parameters, self.magnetometer
+        most = MAX_SAMPLES_RATIO * max(1, math.ceil(parameters.step / self.interval)) + 2
+        shapes = {
+            name: ([most if n == kernel.MOST else n for n in shape], np.int64 if kind == "int" else float)
+            for name, (shape, kind, _) in (kernel.LASTING | kernel.PASSING).items()
+        }
+        arrays: Any = kernel.Arrays(**{name: np.zeros(shape, kind) for name, (shape, kind) in shapes.items()})
+        arrays.force_density[0] = regions.FIRST_DENSITY[0]
+        arrays.field_density[0] = regions.FIRST_DENSITY[0] if magnetometer else 1.0
+        arrays.force_averages[:] = regions.first_memory(2, step)
+        arrays.field_averages[:] = regions.first_memory(1, parameters.heading_interval)
+        return arrays
+
+    def _arguments(self, imu: kernel.Imu, constants: headings.kernel.Constants, delay_sigma: float) -> kernel.Routines:
+        """Return the arguments of the kernels of a recording, for one step or one stamp."""
+        parameters, a, r = self.parameters, imu.arrays, read_only
+        of_force, of_field = map(regions.averages, (max(parameters.step, self.interval), parameters.heading_interval))
+        scales = regions.scales_of(parameters, magnetometer=self.magnetometer)
+        estimate = imu.attitude, imu.bias, imu.variance, imu.covariance
+        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
+        stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
+        of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
+        heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
+        samples = imu.time, imu.gyro, imu.accelerometer, imu.magnetic if self.magnetometer else imu.magnetic[:0]
+        at_rest = starting.kernel.Means(a.found_rate, a.found_rest)
+        return kernel.Routines(
+            follow=(r(a.times), r(a.rates), a.turns),
+            average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
+            end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
+            judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
+            scale=(r(a.force_density), r(a.field_density), scales, a.tilt, a.heading),
+            carry=(at_step, stamps, regions.limits(parameters, delay_sigma), self._found),
+            average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
+            head=(constants, headings.kernel.Steps(*map(r, of_step)), self._memory, headings.kernel.Outputs(*heading)),
+            judge_field=(r(a.field_innovation), of_field, a.field_averages, a.field_density),
+            watch=(starting.constants_of(self.interval, parameters), *map(r, samples), self._rests, at_rest),
         )
 
     # ---------------------------------------------------------------------------------------------------------------------- samples
