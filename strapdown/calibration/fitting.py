@@ -24,8 +24,9 @@ import scipy.sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from strapdown.calibration.intervals import Errors, Intervals, Prediction, predicted, right_jacobian, skew
+from strapdown.calibration.intervals import Errors, Intervals, Prediction, predicted
 from strapdown.checks import Array
+from strapdown.kinematics import right_jacobian, skew
 from strapdown.units import DEGREE
 
 VELOCITY_TIME = 0.3

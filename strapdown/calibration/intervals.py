@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from strapdown.checks import Array, InputError
+from strapdown.kinematics import right_jacobian, skew
 from strapdown.recordings import Recording, sensor_faults
 from strapdown.records.recording import GAP, sampled
 
@@ -240,16 +241,3 @@ class _Sum:
     def mean(self) -> Mean:
         number = np.maximum(self.sensor.number, 1.0)
         return Mean(self.value / number[:, None], *(d / number[:, None, None] for d in (self.by_turn, self.by_own)))
-
-
-def skew(v: Array) -> Array:
-    """Return the matrices [v×] (…, 3, 3)."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    none = np.zeros_like(x)
-    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*v.shape, 3)
-
-
-def right_jacobian(v: Array) -> Array:
-    """Return J of exp(v + d) = exp(v) exp(J d) (…, 3, 3), to third order, for rotations over a sample interval or small errors."""
-    S = skew(v)
-    return np.asarray(np.eye(3) - S / 2.0 + S @ S / 6.0 - S @ S @ S / 24.0)
