@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, place
+from strapdown.kernels.first_state import first_attitude
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
@@ -62,17 +63,9 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
             f"{place('up_b', index)} and {place('magnetic_b', index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
             f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
         )
-    return quaternion.from_matrix(_NORTH_UP @ np.swapaxes(_frame(up, field), -1, -2))
-
-
-def _frame(first: Array, second: Array) -> Array:
-    """Return the axes (b₁, u, e) as columns (..., 3, 3): e along b₁ × b₂, u = e × b₁."""
-    normal = np.cross(first, second)
-    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.stack(np.broadcast_arrays(first, np.cross(normal, first), normal), axis=-1)
-
-
-_NORTH_UP = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    up, field = np.broadcast_arrays(up, field)
+    pairs = zip(up.reshape(-1, 3).tolist(), field.reshape(-1, 3).tolist(), strict=True)
+    return np.array([first_attitude(*pair) for pair in pairs]).reshape(*up.shape[:-1], 4)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
