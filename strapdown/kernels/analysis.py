@@ -4,8 +4,8 @@ The filter of :mod:`strapdown.kernels.filter` runs along the true trajectory, wi
 and its covariance gives the gains. The actual error e, linearised there, is propagated by the same transitions and gains, source by source:
 ``e ← Φ e + …``, and ``e ← e − k (h e + w v)`` for each row h of a measurement, v the noise of the sensor along three axes.
 
-The edges of the walk are those of the gyro and the times of measurements, the increments the true rotations between them. The functions in
-``OPEN`` are those of an instance of the filter. Covariances of n states are by rows, padded as in the filter.
+The edges of the walk are those of the gyro and the times of measurements, the increments the true rotations between them. Covariances of n
+states are by rows, padded as in the filter.
 """
 
 from __future__ import annotations
@@ -34,15 +34,6 @@ from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.structure import Model
 from strapdown.kernels.walk import step_within, turn_squared
 
-OPEN = (
-    "advance",
-    "apply_transition",
-    "clear_step",
-    "fill_coefficients",
-    "take_row",
-    "write",
-    "write_transition",
-)
 CALLED = ("correct_source", "propagate_source", "put_rows", "transform")
 
 NO_BIAS = (0.0, 0.0, 0.0)

@@ -121,8 +121,9 @@ CALLED = (
     "fill_coefficients",
     *(f"write_{s}" for s in range(len(STRUCTURE.sensors))),
 )
-"""Called, not inlined, by other kernels: each copy would be compiled again. An update is inlined: the sixty numbers of its arguments cost a
-tenth of its time, and no kernel has two copies."""
+"""Called, not inlined, by other kernels: each copy would be compiled again. numba compiles them, so that what must be traced is a function
+of its own (``…_formula``). An update is inlined: the sixty numbers of its arguments cost a tenth of its time, and no kernel has two
+copies."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ sums without zeros
@@ -1583,6 +1584,12 @@ def write_whole_bias(P, offsets, row, out):
                 out.whole_covariance[row, b, a] = s
 
 
+def attitude_at(body, i):
+    """Return the attitude of state i."""
+    x = body.x
+    return (x[i, 0], x[i, 1], x[i, 2], x[i, 3])
+
+
 def bias_at(body, i):
     """Return the gyro bias of state i."""
     x = body.x
@@ -1590,18 +1597,6 @@ def bias_at(body, i):
 
 
 # -------------------------------------------------------------------------------------------------------------------------- for the gate
-
-
-def load(form, i):
-    """Return the attitude of state i; the other parts remain in their arrays."""
-    x = form.x
-    return (x[i, 0], x[i, 1], x[i, 2], x[i, 3])
-
-
-def save(form, i, q):
-    """Store the attitude of state i."""
-    for j, value in enumerate(q):
-        form.x[i, j] = value
 
 
 def become(form):
@@ -1612,28 +1607,7 @@ def become(form):
         form.P[0, j] = form.P[1, j]
 
 
-def attitude_of(q):
-    """Return q_fb of a state."""
-    return q
-
-
-def step_limit(form):
-    """Return the longest step, s, allowed by states other than the attitude."""
-    return form.model.limit
-
-
-def propagate(form, i, q, part, dt):
-    """Return the attitude after an increment over dt."""
-    propagate_row(form, i, part, dt)
-    return load(form, i)
-
-
-def store_prediction(form, i, q, k, part, dt, out):
-    """Store a prediction for a smoother."""
-    store_segment(out.segments, k, dt, part, form.x[i], form.P[i])
-
-
-def attitude_covariance(form, i, q):
+def attitude_covariance(form, i):
     """Return the covariance of the attitude (6-tuple)."""
     P = form.P
     return (P[i, 0], P[i, 1], P[i, 2], P[i, W + 1], P[i, W + 2], P[i, 2 * W + 2])
@@ -1648,7 +1622,7 @@ def start_update(form, i):
         work[LINE * PRIOR + j] = 0.0  # prior mean relative to the state of the linearisation
 
 
-def linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior):
+def linearised(form, e, now_q, q, M, measured, kind, sensor):
     """Return the number of rows, y (3,), its prediction by the prior (3,), variances (3,), and θ/sin θ and cos θ of a vector's angle.
 
     The rows are written to the work space, and in the prior's tangent space to ``PRIOR_ROWS``.
@@ -1691,7 +1665,7 @@ def rotate_vectors(array, first, A):
             array[first + k] = value
 
 
-def innovation_covariance(form, i, q, rows):
+def innovation_covariance(form, i, rows):
     """Return H P Hᵀ (6-tuple), zero for absent rows, in the prior's tangent space; write P Hᵀ to the work space."""
     work, P = form.work, form.P[i]
     for r in range(rows):
@@ -1715,7 +1689,7 @@ def row_product(work, a, b, rows):
     return s
 
 
-def step_of(form, i, state, rows, u, M, prior, q, now_q):
+def step_of(form, rows, u, M, q, now_q):
     """Return the attitude part (3,) of the step from the linearisation given by P Hᵀ u, and write the whole step to the work space.
 
     Also return its squared size: of the attitude part, and of the effect of the error states on the rows.
@@ -1753,8 +1727,8 @@ def relinearise(form, i, q, old_q, now_q, prior, fresh):
         work[all_prior + j] -= work[now + j]
 
 
-def correct(form, i, q, rows, e, variance):
-    """Update with independent rows of innovations e (3,) in the prior's tangent space; return q and the correction of the attitude."""
+def correct(form, i, rows, e, variance):
+    """Update with independent rows of innovations e (3,) in the prior's tangent space; return the correction of the attitude."""
     work, x, P = form.work, form.x, form.P[i]
     clear_step(work, 0.0)
     for r in range(rows):
@@ -1767,13 +1741,7 @@ def correct(form, i, q, rows, e, variance):
     step = LINE * STEP
     for j in range(3, N):
         x[i, 1 + j] += work[step + j]
-    return q, (work[step], work[step + 1], work[step + 2])
-
-
-def turn_tangent(form, i, q, M):
-    """Transform the covariance to another tangent space by M."""
-    turn_attitude(form.P[i], M)
-    return q
+    return work[step], work[step + 1], work[step + 2]
 
 
 def turn_covariance(P, v, A):
@@ -1803,16 +1771,18 @@ def turn_vectors(P, A):
         turn_covariance(P, v, A)
 
 
-def set_attitude(form, i, state, q, before):
-    """Rotate the states that are carried with the attitude."""
-    if CARRIES:
-        A = fixed_turn(before, q)
-        rotate_vectors(form.x[i], 1, A)
-        turn_vectors(form.P[i], A)
-    return q
+def turn_carried(x, P, before, after):
+    """Rotate the carried vectors of a state and its covariance from one attitude to another."""
+    A = fixed_turn(before, after)
+    rotate_vectors(x, 1, A)
+    turn_vectors(P, A)
 
 
-CARRIES = len(STRUCTURE.vectors) > 0
+def put_attitude(x, P, before, after):
+    """Replace the attitude of a state, and rotate the states that are carried with it."""
+    turn_carried(x, P, before, after)
+    for j, value in enumerate(after):
+        x[j] = value
 
 
 def start_candidate(form, memory, now, attitude_sigma, restart):
@@ -1916,15 +1886,8 @@ def widen(form, memory):
         for j in range(3, N):
             x[1 + j] += share * work[column + j]
         minus_outer_rows(P, work, column, column, inverse, 0.0)
-    before = load(form, 1)
-    q, G = seen_from(turn, attitude_covariance(form, 1, before))
-    after = quaternion_multiply(before, q)
-    turn_tangent(form, 1, before, G)
-    set_attitude(form, 1, before, after, before)
-    save(form, 1, after)
+    before = attitude_at(form, 1)
+    q, G = seen_from(turn, attitude_covariance(form, 1))
+    turn_attitude(P, G)
+    put_attitude(x, P, before, quaternion_multiply(before, q))
     count_widening(memory)
-
-
-def keep_row(form, q, row, out):
-    """Write the state of the filter to a row of the outputs."""
-    write_row(form, row, out)

@@ -13,27 +13,24 @@ import numpy as np
 
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
 from strapdown.kernels.filter import (
+    attitude_at,
     attitude_covariance,
-    attitude_of,
     become,
     bias_at,
     correct,
     innovation_covariance,
     judge,
-    keep_row,
     linearised,
-    load,
-    propagate,
+    propagate_row,
+    put_attitude,
     relinearise,
-    save,
-    set_attitude,
     start_candidate,
     start_update,
-    step_limit,
     step_of,
-    store_prediction,
-    turn_tangent,
+    store_segment,
+    turn_attitude,
     widen,
+    write_row,
 )
 from strapdown.kernels.gate_rules import (
     CANDIDATE,
@@ -77,31 +74,6 @@ from strapdown.kernels.structure import MAX_PRECISION
 from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.structure import Outputs as FilterOutputs
 from strapdown.kernels.walk import step_within, turn_squared
-
-OPEN = (
-    "load",
-    "save",
-    "become",
-    "attitude_of",
-    "bias_at",
-    "step_limit",
-    "propagate",
-    "store_prediction",
-    "attitude_covariance",
-    "start_update",
-    "linearised",
-    "innovation_covariance",
-    "step_of",
-    "relinearise",
-    "correct",
-    "turn_tangent",
-    "set_attitude",
-    "start_candidate",
-    "widen",
-    "judge",
-    "keep_row",
-)
-"""Functions of the instance of the filter; in this module those of six states."""
 
 
 class Options(NamedTuple):
@@ -183,19 +155,18 @@ def largest_turn(running, part, dt, body):
 
 def longest_step(state, part, dt, body):
     """Return the longest step, s, common to all states."""
-    return min(step_within(largest_turn(state[0], part, dt, body), dt), step_limit(body.form))
+    return min(step_within(largest_turn(state[0], part, dt, body), dt), body.form.model.limit)
 
 
 def predict(state, part, dt, body, out):
     """Propagate the filter and the candidate."""
     running, lock_outs, recoveries, segments, lost = state
     form = body.form
+    if segments < len(out.form.segments):
+        store_segment(out.form.segments, segments, dt, part, form.x[0], form.P[0])
+        segments += 1
     for i in range(running):
-        trajectory = load(form, i)
-        if i == 0 and segments < len(out.form.segments):
-            store_prediction(form, 0, trajectory, segments, part, dt, out.form)
-            segments += 1
-        save(form, i, propagate(form, i, trajectory, part, dt))
+        propagate_row(form, i, part, dt)
     return running, lock_outs, recoveries, segments, lost
 
 
@@ -243,7 +214,7 @@ def update(state, e, now, measured, body, out):
 
 def keep(state, row, e, body, out):
     """Write a row."""
-    keep_row(body.form, load(body.form, 0), row, out.form)
+    write_row(body.form, row, out.form)
     return state
 
 
@@ -284,12 +255,11 @@ def iterated_update(form, i, e, measured, passes, options):
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
     parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
-    state = load(form, i)
-    q = attitude_of(state)
+    q = attitude_at(form, i)
     R = rotation_matrix(q)
     if kind == HEADING and not has_heading(R, z):
         return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), False
-    A = attitude_covariance(form, i, state)
+    A = attitude_covariance(form, i)
     unknown = A[0] + A[3] + A[5] >= UNKNOWN
     tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     now_q = q
@@ -301,8 +271,8 @@ def iterated_update(form, i, e, measured, passes, options):
     done = 1
     trials = 0
     while True:
-        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior)
-        S = innovation_covariance(form, i, state, rows)
+        rows, y, p, variance, far, along = linearised(form, e, now_q, q, M, measured, kind, sensor)
+        S = innovation_covariance(form, i, rows)
         F = factored(with_noise(S, variance))
         innovation = (y[0] - p[0], y[1] - p[1], y[2] - p[2])
         e1, e2, e3 = independent(F, innovation)
@@ -318,7 +288,7 @@ def iterated_update(form, i, e, measured, passes, options):
             weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
             weighted = factored(with_noise(S, scale(1.0 / weight, variance)))
         u = solved(weighted, (far * y[0] - p[0], far * y[1] - p[1], innovation[2]))
-        step, squared = step_of(form, i, state, rows, u, M, prior, q, now_q)
+        step, squared = step_of(form, rows, u, M, q, now_q)
         converged = squared < tolerance * tolerance
         fresh = False
         if converged or done >= passes:
@@ -345,8 +315,8 @@ def iterated_update(form, i, e, measured, passes, options):
     elif accepted:
         outcome = ACCEPTED
         lost = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2]) < 1.0 / MAX_PRECISION
-        state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
-        reset_from(form, i, state, q, now_q, add(prior, matrix_times_vector(M, taken)), M)
+        taken = correct(form, i, rows, innovation, scale(1.0 / weight, variance))
+        reset_from(form, i, q, now_q, add(prior, matrix_times_vector(M, taken)), M)
     else:
         weight = 0.0
     return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost
@@ -364,12 +334,12 @@ def independent(F, innovation):
     return e1, e2, innovation[2] - F[1] * e1 - F[2] * e2
 
 
-def reset_from(form, i, state, q, now_q, step, M):
+def reset_from(form, i, q, now_q, step, M):
     """Move the attitude of the linearisation by a step, and the covariance to the tangent space of the result."""
-    state = turn_tangent(form, i, state, M)
-    A = attitude_covariance(form, i, state)
+    turn_attitude(form.P[i], M)
+    A = attitude_covariance(form, i)
     new_q, G = moved(now_q, step)
     if A[0] + A[3] + A[5] > KNOWN:
         _, G = seen_from(step, A)
-    state = turn_tangent(form, i, state, G)
-    save(form, i, set_attitude(form, i, state, new_q, q))
+    turn_attitude(form.P[i], G)
+    put_attitude(form.x[i], form.P[i], q, new_q)

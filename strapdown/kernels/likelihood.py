@@ -21,7 +21,6 @@ from strapdown.kernels.state import load_triple
 from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.walk import MAX_TURN
 
-OPEN = ("advance", "fill_coefficients", "take")
 REPLACEABLE = ("counted",)
 
 HALF_RANGE = 0.25 * SQUARED_RANGE

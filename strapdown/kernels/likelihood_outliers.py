@@ -13,9 +13,6 @@ from strapdown.kernels.filter import LINES, PRIOR, ROWS, STEP, apply_step, clear
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
 from strapdown.kernels.likelihood import WIDE, WORK, deviance_of
 
-OPEN = ("apply_step", "clear_step", "take_row", "write")
-"""Functions of the instance of the filter."""
-
 
 def mixed(share, nis, product, wide, wide_product):
     """Return minus the log likelihood of a measurement, and the probability that it is an outlier.

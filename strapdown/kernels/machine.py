@@ -3,9 +3,10 @@
 A kernel refers to its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
 compiled copies ("twins") together, so the source needs no decorator and remains plain Python.
 
-A kernel may leave functions open: their names are in ``OPEN`` of its module, which has only their signatures or one of the definitions.
-:func:`compiled` is given the modules that define them; in this way :func:`strapdown.kernels.walk.walk` is the loop of every filter. A name
-in ``REPLACEABLE`` has a default, which is used if no module defines it.
+A kernel may leave functions open: their names are in ``OPEN`` of its module, which has only their signatures. :func:`compiled` is given the
+modules that define them; in this way :func:`strapdown.kernels.walk.walk` is the loop of every filter. A name in ``REPLACEABLE`` has a
+default, which is used if no module defines it. If one of these modules is an :func:`instance`, it also defines what kernels import from the
+module of which it is a copy.
 """
 
 from __future__ import annotations
@@ -71,11 +72,18 @@ def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
 
 
+def _instance_of(function: FunctionType, parts: tuple[ModuleType, ...]) -> ModuleType | None:
+    """Return the instance of a function's module among ``parts``."""
+    return next((module for module in parts if vars(module).get("TEMPLATE") == function.__module__), None)
+
+
 @functools.cache
-def _depends_on_parts(function: FunctionType) -> bool:
-    """Return whether a function refers, directly or indirectly, to an open one."""
-    named = _kernels_named(function)
-    return any(name in _open(function) or _depends_on_parts(value) for name, value in named.items())
+def _depends_on_parts(function: FunctionType, parts: tuple[ModuleType, ...]) -> bool:
+    """Return whether a function refers, directly or indirectly, to one that ``parts`` define."""
+    return any(
+        name in _open(function) or _instance_of(value, parts) or _depends_on_parts(value, parts)
+        for name, value in _kernels_named(function).items()
+    )
 
 
 def _open(scope: FunctionType | ModuleType) -> tuple[str, ...]:
@@ -85,9 +93,10 @@ def _open(scope: FunctionType | ModuleType) -> tuple[str, ...]:
 
 
 def _defined(name: str, value: FunctionType, function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
-    """Return the value of a name in a function; if the name is open, its definition in the first of ``parts`` that has one."""
+    """Return the value of a name in a function: if the name is open, its definition in the first of ``parts`` that has one."""
     if name not in _open(function):
-        return value
+        of_instance = _instance_of(value, parts)
+        return cast(FunctionType, getattr(of_instance, value.__name__)) if of_instance else value
     for module in parts:
         definition = getattr(module, name, None)
         if isinstance(definition, FunctionType) and name not in _open(module):
@@ -113,7 +122,7 @@ def _checked(
             raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
         if isinstance(value, FunctionType) and _is_kernel(value):
             value = _defined(name, value, function, parts)
-            checked[name] = (value, parts if _depends_on_parts(value) else ())
+            checked[name] = (value, parts if _depends_on_parts(value, parts) else ())
             _checked(*checked[name])
     return checked
 
@@ -230,7 +239,7 @@ def instance(module: ModuleType, **constants: Hashable) -> ModuleType:
     digest = hashlib.sha256(repr(sorted(constants.items())).encode()).hexdigest()[:16]
     copy = ModuleType(f"{module.__name__}_{digest}", module.__doc__)
     copy.__file__ = module.__file__
-    copy.__dict__.update(constants)
+    copy.__dict__.update(constants, TEMPLATE=module.__name__)
     sys.modules[copy.__name__] = copy  # numba looks there for the module of a function that it reads from its cache
     exec(compile(Path(str(module.__file__)).read_text(), str(module.__file__), "exec"), copy.__dict__)
     return copy

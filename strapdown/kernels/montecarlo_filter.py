@@ -1,4 +1,4 @@
-"""The filter of N error states in a Monte Carlo: an instance of :mod:`strapdown.kernels.filter` for eight runs, which defines ``OPEN``."""
+"""The filter of N error states in a Monte Carlo: an instance of :mod:`strapdown.kernels.filter` for eight runs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from strapdown.kernels.filter import advance, element_at, fill_coefficients, put
 from strapdown.kernels.lane_values import WIDTH, load_like, store
 from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.state import store_several
-
-OPEN = ("advance", "element_at", "fill_coefficients", "put_element", "take", "whole_element")
 
 
 class Progress(NamedTuple):

@@ -6,7 +6,7 @@ nothing of the size of P is subtracted. A row of N is by the first form, or by t
 of the noise. The later covariance is transformed to the tangent space at the predicted attitude before the step, and the result to that at
 the smoothed attitude after it; so are states that rotate with the attitude.
 
-The functions in ``OPEN`` are those of an instance of :mod:`strapdown.kernels.filter`. Matrices are stored by rows, padded to a multiple of
+The functions of :mod:`strapdown.kernels.filter` are those of an instance. Matrices are stored by rows, padded to a multiple of
 eight columns.
 """
 
@@ -19,19 +19,18 @@ import numpy as np
 from strapdown.kernels.filter import (
     apply_transition,
     fill_coefficients,
-    fixed_turn,
     gather_noisy_columns,
     minus_row,
     noisy_row_at,
     predict_state,
+    put_attitude,
     put_noisy_row,
     put_row,
-    rotate_vectors,
     row_at,
     scatter_noisy_columns,
     transform,
     turn_attitude,
-    turn_vectors,
+    turn_carried,
     write_noise,
     write_transition,
 )
@@ -39,24 +38,6 @@ from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
 
-OPEN = (
-    "apply_transition",
-    "fill_coefficients",
-    "gather_noisy_columns",
-    "minus_row",
-    "noisy_row_at",
-    "predict_state",
-    "put_noisy_row",
-    "put_row",
-    "rotate_vectors",
-    "row_at",
-    "scatter_noisy_columns",
-    "transform",
-    "turn_attitude",
-    "turn_vectors",
-    "write_noise",
-    "write_transition",
-)
 CALLED = ("factorise", "solve", "add_product", "load_segment", "write_small_columns")
 
 ROWS = 6
@@ -220,7 +201,7 @@ def step_back(segments, k, models, space):
     relative_error(predicted, later_x, later_P, error)
     fill_coefficients(coefficients, -dt, models.backward)
     write_transition(predicted, back, -dt, models.backward, coefficients, space.top, 0.0)
-    apply_error(error, space.top, coefficients)
+    apply_transition(error, space.top, coefficients, 0.0)
     write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
     copy_state(predicted, after)
     transform(after, later_P, back, -dt, models.backward, coefficients, 0.0)
@@ -253,11 +234,6 @@ def copy_state(x, y):
     """Copy a state to y."""
     for i in range(len(x)):
         y[i] = x[i]
-
-
-def apply_error(error, top, coefficients):
-    """Apply the transition to an error."""
-    apply_transition(error, top, coefficients, 0.0)
 
 
 def write_small_columns(P, Q, gain, kept, states, n, width):
@@ -301,9 +277,7 @@ def relative_error(predicted, later_x, later_P, error):
     later_q = (later_x[0], later_x[1], later_x[2], later_x[3])
     a = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), later_q))
     turn_attitude(later_P, inverse_right_jacobian(a))
-    A = fixed_turn(later_q, q)
-    rotate_vectors(later_x, 1, A)
-    turn_vectors(later_P, A)
+    turn_carried(later_x, later_P, later_q, q)
     error[0], error[1], error[2] = a
     for i in range(3, len(later_x) - 1):
         error[i] = later_x[1 + i] - predicted[1 + i]
@@ -313,14 +287,10 @@ def correct_filtered(x, error, later_x, later_P):
     """Write the filtered state corrected by the error, and transform the covariance to the tangent space there."""
     q = (x[0], x[1], x[2], x[3])
     new_q, J = moved(q, (error[0], error[1], error[2]))
-    for i, value in enumerate(new_q):
-        later_x[i] = value
     for i in range(3, len(x) - 1):
         later_x[1 + i] = x[1 + i] + error[i]
     turn_attitude(later_P, J)
-    A = fixed_turn(q, new_q)
-    rotate_vectors(later_x, 1, A)
-    turn_vectors(later_P, A)
+    put_attitude(later_x, later_P, q, new_q)
 
 
 def smooth_back(segments, starts, first, models, space, out):
