@@ -17,7 +17,7 @@ import numpy as np
 from strapdown import kinematics, quaternion
 from strapdown.checks import Array
 from strapdown.estimation import model as modelling
-from strapdown.estimation.forward import gate_events, remembered, restart_states
+from strapdown.estimation.forward import aged_states, gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
@@ -383,7 +383,7 @@ class GatedStepFilter(StepFilter):
     def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
         """Return a restart candidate: optional states at their prior, attitude and bias independent of them, with the given uncertainty."""
         (time, *prior), m = self._restart_prior, len(self.values)
-        values, Pc = modelling.aged_prior(self.error_states, *prior, self.time - time)
+        values, Pc = aged_states(self._motion, *prior, self.time - time)
         P = np.zeros((6 + m, 6 + m))
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)

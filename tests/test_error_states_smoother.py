@@ -23,7 +23,7 @@ from strapdown import estimation, kinematics, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
-from strapdown.estimation.model import aged_prior
+from strapdown.estimation.model import assemble
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 
@@ -76,8 +76,13 @@ def turns_of(blocks, increments, dt, q, b, c):
     return np.linalg.solve(np.eye(3) + np.einsum("nk,kij->nij", c, T), left[..., None])[..., 0]
 
 
+def system(blocks):
+    """A of ``ċ = A c + …``."""
+    return np.diag(-stacked(blocks, "decay", ())) + np.diag(stacked(blocks, "feed", ())[:-1], 1)
+
+
 def transition_of(blocks, dt):
-    return scipy.linalg.block_diag(*(block.transition(dt) for block in blocks))
+    return scipy.linalg.expm(system(blocks) * dt) if blocks else np.empty((0, 0))
 
 
 def driven(blocks, noise, w, dt):
@@ -86,7 +91,7 @@ def driven(blocks, noise, w, dt):
     A, D = np.zeros((6 + m, 6 + m)), np.zeros((6 + m, 6 + m))
     A[:3, :3], A[:3, 3:6] = -kinematics.skew(w), -np.eye(3)
     A[:3, 6:] = -stacked(blocks, "gyro_offset", (3,)).T
-    A[6:, 6:] = np.diag(-stacked(blocks, "decay", ())) + np.diag(stacked(blocks, "feed", ())[:-1], 1) if m else 0.0
+    A[6:, 6:] = system(blocks) if m else 0.0
     D[:3, :3], D[3:6, 3:6] = noise.angle_random_walk**2 * np.eye(3), noise.rate_random_walk**2 * np.eye(3)
     D[6:, 6:] = np.diag(stacked(blocks, "density", ()))
     whole = scipy.linalg.expm(np.block([[-A, D], [np.zeros_like(A), A.T]]) * dt)
@@ -531,7 +536,8 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
         record, vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors)
     )
     ahead = estimation.run(bare, NOISE, begun, blocks, full_covariance=True)
-    aged, covariance = aged_prior(blocks, *forward.restart_states(begun, blocks), 2.0)
+    model = assemble(blocks, {series.sensor: series.kind for series in record.vectors})
+    aged, covariance = forward.aged_states(model, *forward.restart_states(begun, blocks), 2.0)
     sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
     expected = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
     np.testing.assert_allclose(aged / sigma, expected / sigma, rtol=0, atol=1e-8)

@@ -17,7 +17,8 @@ from sims import hand_held
 from strapdown import ahrs, consistency, estimation, kinematics, quaternion
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
-from strapdown.estimation import error_states, setup
+from strapdown.estimation import error_states, forward, setup
+from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import stationary_covariance
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
@@ -77,6 +78,13 @@ def exactly(A: np.ndarray, q: np.ndarray, dt: float, digits: int = 60) -> tuple[
         return (np.array(m.tolist(), float) for m in (phi, Q))
 
 
+def aged(block, dt, values=0.0, covariance=0.0):
+    """Values and covariance after a time without measurements."""
+    n = block.size
+    model = modelling.assemble((block,), {"acc": "vector"})
+    return forward.aged_states(model, np.full(n, values), np.full((n, n), covariance), dt)
+
+
 # ---------------------------------------------------------------------------------------------------------- transition and noise
 
 
@@ -86,10 +94,12 @@ def test_transition_and_noise_are_those_of_van_loan(poles, dt):
     block = block_of(poles)
     A, q = system(block)
     phi, Q = exactly(A, q, dt)
-    np.testing.assert_allclose(block.transition(dt), phi, rtol=1e-12, atol=0)
-    np.testing.assert_allclose(block.transition(dt), scipy.linalg.expm(A * dt), rtol=0, atol=1e-13)
+    n = block.size
+    values = np.transpose([aged(block, dt, column)[0] for column in np.eye(n)])
+    np.testing.assert_allclose(values, phi, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(values, scipy.linalg.expm(A * dt), rtol=0, atol=1e-13)
     sigma = np.sqrt(np.where(np.diag(Q) > 0.0, np.diag(Q), 1.0))
-    assert np.max(np.abs(block.process_noise(dt) - Q) / np.outer(sigma, sigma)) < 1e-10
+    assert np.max(np.abs(aged(block, dt)[1] - Q) / np.outer(sigma, sigma)) < 1e-10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,8 +176,7 @@ def test_the_start_is_stationary(poles):
     np.testing.assert_allclose(P, scipy.linalg.solve_continuous_lyapunov(A, -np.diag(q)), rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(block.sigma**2, np.diag(P), rtol=1e-14)
     for dt in (0.01, 0.4):
-        phi = block.transition(dt)
-        np.testing.assert_allclose(phi @ P @ phi.T + block.process_noise(dt), P, rtol=1e-10, atol=1e-15)
+        np.testing.assert_allclose(aged(block, dt, covariance=P)[1], P, rtol=1e-10, atol=1e-15)
     state = estimation.with_error_states(
         start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block)
     )

@@ -14,8 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
-from strapdown.kernels import chains
-from strapdown.kernels.algebra import full
 from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
@@ -34,8 +32,6 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
-MAX_CHAIN_DECAY = 0.5
-"""Largest λ dt of a state in a chain in one step for which its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Names of the entries of a matrix, row by row: x, xy, xz, yx, y, …"""
 
@@ -148,60 +144,6 @@ class ErrorStates(ByValue):
     def effects(self) -> Mapping[str, Effect]:
         """Effect on each sensor, by its name."""
         return {}
-
-    def transition(self, dt: float) -> Array:
-        """Return the transition matrix Φ.
-
-        Parameters
-        ----------
-        dt : float
-            Time step, s.
-
-        Returns
-        -------
-        ndarray (size, size)
-            Φ of these states over ``dt``.
-        """
-        return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
-
-    def process_noise(self, dt: float) -> Array:
-        """Return the covariance Q of the process noise.
-
-        Parameters
-        ----------
-        dt : float
-            Time step, s.
-
-        Returns
-        -------
-        ndarray (size, size)
-            Q of these states over ``dt``, in their units squared.
-        """
-        if np.any(self.feed):
-            return self._chained(dt)[1]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            time = np.where(self.decay > 0.0, -0.5 * np.expm1(-2.0 * self.decay * dt) / self.decay, dt)
-        return np.diag(self.density * time)
-
-    def _chained(self, dt: float) -> tuple[Array, Array]:
-        """Return Φ and Q of states in chains: the kernel's series for a short enough step, then repeated doubling."""
-        if dt == 0.0:  # the series divides by dt
-            return np.eye(self.size), np.zeros((self.size, self.size))
-        decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
-        link = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
-        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MAX_CHAIN_DECAY, 1e-9)))))
-        h = dt / 2**doublings
-        phi, Q = np.zeros((2, self.size, self.size))
-        for k in range(self.size):
-            first = chains.chain_start(link, k)
-            own = slice(first, k + 1)
-            column, driven = chains.chain_step(decay, link, k, first, h)
-            there = slice(first - k - 1, None)  # of the last three states those that the chain has
-            phi[own, k] = column[there]
-            Q[own, own] += density[k] * np.reshape(full(driven), (3, 3))[there, there]
-        for _ in range(doublings):
-            phi, Q = phi @ phi, phi @ Q @ phi.T + Q
-        return phi, Q
 
 
 def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:

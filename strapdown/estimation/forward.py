@@ -540,6 +540,15 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
     return state.values, P
 
 
+def aged_states(model: Model, values: Array, covariance: Array, dt: float) -> tuple[Array, Array]:
+    """Return values (m,) and covariance (m, m) of error states after dt, s, without measurements: the kernels' function as plain Python."""
+    kernels = instance_of(model)
+    x, P = np.append(np.zeros(7), values), np.zeros((kernels.N, kernels.W))
+    P[6:, 6 : kernels.N] = covariance
+    kernels.age_states(x, P.reshape(-1), np.zeros(kernels.SET * len(model.last)), dt, model)
+    return x[7:], P[6:, 6 : kernels.N]
+
+
 # ------------------------------------------------------------------------------------------------------------- the filter of N error states
 
 

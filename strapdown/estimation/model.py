@@ -331,13 +331,3 @@ def _numbers(block: ErrorStates, effect: Effect) -> Array:
             numbers = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)
             rows[:, place : place + numbers.shape[1]] = numbers
     return rows
-
-
-def aged_prior(
-    error_states: tuple[ErrorStates, ...], values: Array, covariance: Array, dt: float
-) -> tuple[Array, Array]:
-    """Return values (m,) and covariance (m, m) of the error states after dt, s, without measurements."""
-    transition, driven = np.zeros((2, len(values), len(values)))
-    for block, own in spans(error_states):
-        transition[own, own], driven[own, own] = block.transition(dt), block.process_noise(dt)
-    return transition @ values, transition @ covariance @ transition.T + driven

@@ -26,7 +26,6 @@ import numpy as np
 
 from strapdown.checks import Array, InputError
 from strapdown.estimation import forward, recovery_segments
-from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Options, Problem
 from strapdown.estimation.gating import Gate, Robust
@@ -226,7 +225,7 @@ class _Smoother:
                 continue
             bias, variance, counts = recovery_segments.restarted(gate, memory)
             age = gap.since - memory.start
-            values, P = modelling.aged_prior(self.problem.error_states, memory.values, memory.covariance, age)
+            values, P = forward.aged_states(self.problem.model, memory.values, memory.covariance, age)
             stop = recovery_segments.stops(record.time, [gap])
             lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, gap.since)]
             whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
