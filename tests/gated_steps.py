@@ -17,7 +17,7 @@ import numpy as np
 from strapdown import kinematics, quaternion
 from strapdown.checks import Array
 from strapdown.estimation import model as modelling
-from strapdown.estimation.forward import aged_states, gate_events, remembered, restart_states
+from strapdown.estimation.forward import aged_states, gate_events, in_order, last_lock_outs, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
@@ -212,36 +212,34 @@ class Supervision:
         self.gate, self.sensors = gate, ()
         self.memory, self.counters = remembered(gate, None, ())
         self.candidate: GatedStepFilter | None = None
-        self.recoveries, self.lock_outs = np.empty((0, 4)), np.empty((0, 4))
+        self.reported = np.empty((0, 5))
 
     @property
     def events(self) -> tuple[Event, ...]:
         """Recoveries and lock-outs up to now, in order of time."""
-        events = gate_events(self.recoveries, self.lock_outs, self.sensors)
-        return tuple(sorted(events, key=lambda event: event.start))
+        events = gate_events(self.reported, self.sensors)
+        return in_order([*events, *last_lock_outs(self.counters, self.sensors)])
 
     def judge(self, filter: Any, sensor: str, outcome: int, update: Callable[[Any], int]) -> None:
         """Count the outcome of a measurement for a filter; ``update`` updates the restart candidate with it."""
         if self.gate is None:
             return
         s, recovery, limit = self._row_of(sensor), self.gate.recovery or 0, self.gate.lock_out_limit
-        memory, counters, room = self.memory, self.counters, np.vstack([self.lock_outs, np.empty((1, 4))])
+        memory, counters = self.memory, self.counters
+        events, number = np.vstack([self.reported, np.empty((2 + len(self.sensors), 5))]), len(self.reported)
         number, restart = gate_rules.judge_filter(
-            outcome, filter.time, s, recovery, limit, counters, memory, room, len(self.lock_outs)
+            outcome, filter.time, s, recovery, limit, counters, memory, events, number
         )
-        self.lock_outs = room[:number]
         if restart:
             self._start_candidate(filter, self.gate)
-        if self.candidate is None:
-            return
-        self._judge_candidate(self.candidate, s, update(self.candidate))
+        if self.candidate is not None:
+            self._judge_candidate(self.candidate, s, update(self.candidate))
         if self.candidate is not None and gate_rules.takes_over(s, recovery, counters, memory):
-            row = np.empty(4)
-            gate_rules.recover(filter.time, s, limit, counters, memory, row, self.lock_outs)
-            self.recoveries = np.vstack([self.recoveries, row])
+            number = gate_rules.recover(filter.time, s, limit, counters, memory, events, number)
             filter._become(self.candidate)
             filter._passes = int(memory[gate_rules.PASSES])
             self.candidate = None
+        self.reported = events[:number]
 
     def _row_of(self, sensor: str) -> int:
         """Return the row of a sensor in the counters."""

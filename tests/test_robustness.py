@@ -9,7 +9,7 @@ from measured import assert_inside, drawn_start, errors, recoveries, turn_to
 from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
-from strapdown.estimation import gating
+from strapdown.estimation import forward, gating
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
@@ -243,19 +243,18 @@ def test_a_record_in_parts_recovers_as_the_whole_does(case):
 
 
 def judged(outcomes, recovery=3, limit=4):
-    """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts, recoveries and lock-outs."""
+    """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts and events."""
     memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.COUNTERS))
-    counters[:, gate_rules.REPORTED] = -1.0
-    lock_outs, count, verdicts = np.zeros((9, 4)), 0, []
+    events, count, verdicts = np.zeros((9, 5)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):
         count, begins = gate_rules.judge_filter(
-            mine, float(k), sensor, recovery, limit, counters, memory, lock_outs, count
+            mine, float(k), sensor, recovery, limit, counters, memory, events, count
         )
         if begins:
             gate_rules.reset_candidate(memory, float(k), np.zeros(3), np.ones(3))
         if memory[gate_rules.CANDIDATE]:
             verdicts.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, counters, memory, np.zeros(3)))
-    return memory, counters, lock_outs[:count], verdicts
+    return memory, counters, [list(row) for row in events[:count]], verdicts
 
 
 def test_the_rules_of_a_gate():
@@ -268,7 +267,7 @@ def test_the_rules_of_a_gate():
         followed,
     ]  # of which the other sensor is none refused
     assert judged([refused, (1, ACCEPTED, ACCEPTED)])[0][gate_rules.HITS] == 1.0  # what the filter accepts too is none
-    memory, counters, lock_outs, verdicts = judged([refused, both, both])
+    memory, counters, _, verdicts = judged([refused, both, both])
     assert verdicts == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
     assert (memory[gate_rules.LEVEL], memory[gate_rules.CANDIDATE]) == (1.0, 0.0)
     assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
@@ -276,28 +275,35 @@ def test_the_rules_of_a_gate():
     assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
     memory, counters, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
     assert not gate_rules.takes_over(0, 3, counters, memory)
-    memory, counters, lock_outs, verdicts = judged([(1, ACCEPTED, None)] * 15 + [refused, both, both, refused])
+    memory, counters, _, verdicts = judged([(1, ACCEPTED, None)] * 15 + [refused, both, both, refused])
     assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
         memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
         assert memory[gate_rules.LEVEL] == level
-    memory, counters, lock_outs, verdicts = judged([refused] * 6)
-    assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
+    memory, counters, events, verdicts = judged([refused] * 6)
+    (event,) = forward.last_lock_outs(counters, ("a", "b"))
+    assert (event.kind, event.start, event.end, event.sensor, event.value) == ("lock-out", 0.0, 5.0, "a", 6.0)
+    assert not events
     assert gate_rules.takes_over(0, 3, counters, memory)
     assert not gate_rules.takes_over(1, 3, counters, memory)
     assert not gate_rules.takes_over(0, 7, counters, memory)
-    row = np.zeros(4)
+    rows = np.zeros((3, 5))
     memory[gate_rules.SINCE] = 2.0
-    gate_rules.recover(5.0, 0, 4, counters, memory, row, lock_outs)
-    assert list(row) == [5.0, 0.0, 0.0, 6.0]
-    assert lock_outs[0, 3] == 0.0
-    assert not counters[:, : gate_rules.REPORTED].any()
+    assert gate_rules.recover(5.0, 0, 4, counters, memory, rows, 1) == 2  # the lock-out is part of it
+    assert list(rows[1]) == [gate_rules.RECOVERY, 0.0, 0.0, 5.0, 6.0]
+    assert not counters.any()
     assert memory[gate_rules.PASSES] == gate_rules.WIDE_PASSES
-    memory, counters, lock_outs, _ = judged([(1, REFUSED, ACCEPTED)] + [refused] * 9)
+    memory, counters, _, _ = judged([(1, REFUSED, ACCEPTED)] + [refused] * 9)
     assert counters[0, gate_rules.EXCESS] == 8.0  # twice the limit, and no more
-    gate_rules.recover(9.0, 0, 4, counters, memory, row, lock_outs)
-    assert list(row) == [9.0, 0.0, 0.0, 9.0]  # from the first refusal of the other sensor, which started the candidate
-    assert lock_outs[0, 3] == 9.0  # longer than a recovery stands for
+    assert gate_rules.recover(9.0, 0, 4, counters, memory, rows, 0) == 2
+    # From the first refusal of the other sensor, which started the candidate; and a lock-out longer than a recovery stands for.
+    assert rows[:2].tolist() == [[gate_rules.RECOVERY, 0.0, 0.0, 9.0, 9.0], [gate_rules.LOCK_OUT, 0.0, 1.0, 9.0, 9.0]]
+    memory, counters, events, _ = judged([refused] * 5 + [(0, ACCEPTED, REFUSED)] * 5 + [refused])
+    assert events == [[gate_rules.LOCK_OUT, 0.0, 0.0, 4.0, 5.0]]
+    assert not forward.last_lock_outs(counters, ("a", "b"))
+    memory, counters, events, _ = judged([refused] * 5 + [(0, ACCEPTED, REFUSED)] * 5)
+    assert not events
+    assert gate_rules.recover(9.0, 0, 4, counters, memory, rows, 0) == 2  # it had ended before
     memory[gate_rules.LEVEL] = gate_rules.WIDEST
     gate_rules.step_aside(memory)
     assert memory[gate_rules.LEVEL] == 0.0

@@ -7,7 +7,7 @@ The filter is that of :mod:`strapdown.kernels.filter`, compiled for its number o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -452,15 +452,14 @@ class Judge:
     def outputs(self, form: structure.Outputs) -> gate.Outputs:
         """Return arrays for the outputs of the gate in addition to the filter's.
 
-        A recovery or a lock-out needs two refusals, except the first recovery, whose other refusals may lie in the part before, and a
-        lock-out that continues.
+        A recovery and a lock-out need two refusals each, except the first recovery, whose other refusals may lie in the part before, and
+        lock-outs that continue.
         """
         number = len(self.problem.events.time)
         return gate.Outputs(
             form=form,
             weight=np.empty(number),
-            recoveries=np.empty((number // 2 + 1, 4)),
-            lock_outs=np.empty((number // 2 + len(self.problem.events.sensors), 4)),
+            events=np.empty((number + 1 + len(self.problem.events.sensors), 5)),
         )
 
     def remembered(self, body: structure.Body) -> GateMemory | None:
@@ -514,17 +513,25 @@ def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str
             row[:] = memory.counters.get(sensor, 0.0)
     if gate_ is None or not gate_.recovery:
         counts[gate_rules.CANDIDATE] = 0.0
-    counters[:, gate_rules.REPORTED] = -1.0
+    counters[:, gate_rules.LOCKED_OUT] = 0.0
     return counts, counters
 
 
-def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -> list[Event]:
-    """Return recoveries (n, 4) and lock-outs (m, 4) from a kernel as events."""
-    rows = [("recovery", row[[2, 0, 1, 3]]) for row in recoveries]
-    rows += [("lock-out", row) for row in lock_outs if row[3] > 0.0]
+def gate_events(rows: Array, sensors: Sequence[str]) -> list[Event]:
+    """Return events (n, 5) from a kernel."""
+    kinds = {gate_rules.RECOVERY: "recovery", gate_rules.LOCK_OUT: "lock-out"}
     return [
-        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
-        for kind, (start, end, sensor, value) in rows
+        Event(kind=kinds[kind], start=start, end=end, sensor=sensors[int(sensor)], value=value)
+        for kind, sensor, start, end, value in rows.tolist()
+    ]
+
+
+def last_lock_outs(counters: Array, sensors: Iterable[str]) -> list[Event]:
+    """Return the lock-outs in the counters of the sensors, which a kernel has not reported."""
+    return [
+        Event(kind="lock-out", start=first, end=last, sensor=sensor, value=number)
+        for sensor, (_, _, number, first, last, locked_out) in zip(sensors, counters.tolist(), strict=True)
+        if locked_out
     ]
 
 
@@ -629,8 +636,7 @@ def _run(problem: Problem, options: Options) -> Passed:
     out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, number = None, 0
-    # A lock-out that continues in a second span is reported there as a whole.
-    happened: dict[tuple[str, str, float], Event] = {}
+    happened = gaps(record)
     if options.judged:
         judged = judge.outputs(out)
         weight = judged.weight
@@ -638,10 +644,9 @@ def _run(problem: Problem, options: Options) -> Passed:
         form = body._replace(length=body.length[at], turning=body.turning[at])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
-            outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0
-            number, recovered, locked = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
-            reports = gate_events(judged.recoveries[:recovered], judged.lock_outs[:locked], events.sensors)
-            happened |= {(event.kind, event.sensor, event.start): event for event in reports}
+            outputs = judged._replace(form=out_of_part)
+            number, reported = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
+            happened += gate_events(judged.events[:reported], events.sensors)
         else:
             number = compiled(walk, kernels)(*arguments, every, form, out_of_part)
         if number < 0:
@@ -650,13 +655,14 @@ def _run(problem: Problem, options: Options) -> Passed:
         stored[number, :4] = 0.0
         stored[number, 4 : 5 + n] = body.x[0]
         stored[number, 5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]
+    happened += last_lock_outs(judge.counters, events.sensors)
     innovations = innovations_by_sensor(events, out.innovation, weight)
     covariance = out.covariance if len(out.covariance) else None
     estimate = replace(
         estimate_of(problem, every, out.x, out.variance, covariance),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=in_order([*gaps(record), *happened.values()]),
+        events=in_order(happened),
     )
     if options.whole_bias:
         estimate = replace(

@@ -33,10 +33,10 @@ from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.features import refuse
-from strapdown.estimation.forward import Judge, Options, gate_events
+from strapdown.estimation.forward import Judge, Options, gate_events, last_lock_outs
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import Change, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import gate, gate_rules, six_states, structure
+from strapdown.kernels import gate, six_states, structure
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.machine import address_of, compiled, read_only
@@ -151,19 +151,17 @@ class LiveFilter:
         filter_: Any = (
             forward.filter_body(self._problem, {}) if self._whole else forward.body_in_registers(self._problem)
         )
-        # All that changes lies in one array, of which a copy is a snapshot. Continuing lock-outs are the last rows of the array in which
-        # the kernel reports new ones.
+        # All that changes lies in one array, of which a copy is a snapshot.
         own = [filter_.x, filter_.P] if self._whole else [filter_.state]
-        parts = [np.zeros((sensors, 4)), judge.counters, judge.memory, np.zeros((sensors, 2)), *own]
+        parts = [judge.counters, judge.memory, np.zeros((sensors, 2)), *own]
         sizes = np.cumsum([0, *(part.size for part in parts)])
-        memory = np.zeros(4 * most + sizes[-1])
-        self._state = memory[4 * most :]
+        self._state = np.zeros(sizes[-1])
         views = [self._state[a:b].reshape(part.shape) for a, b, part in zip(sizes, sizes[1:], parts, strict=False)]
         for view, part in zip(views, parts, strict=True):
             view[...] = part
-        self._slots, judge.counters, judge.memory, self._counts, *own = views
-        self._recoveries, self._lock_outs = np.zeros((most, 4)), memory[: 4 * (most + sensors)].reshape(-1, 4)
+        judge.counters, judge.memory, self._counts, *own = views
         self._innovation, self._weight = np.zeros((most, 6)), np.ones(most)
+        self._events = np.zeros((2 * most + sensors, 5))
         length, size = np.ones(most), 6 + model.states
         body: Any
         out: Any
@@ -186,10 +184,10 @@ class LiveFilter:
             out = six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
         self._body = body
         if options.judged:
-            out = gate.Outputs(form=out, weight=self._weight, recoveries=self._recoveries, lock_outs=self._lock_outs)
+            out = gate.Outputs(form=out, weight=self._weight, events=self._events)
             body = judge.body(body)
         bodies = (gate, kernels) if options.judged else (kernels if self._whole else six_states,)
-        self._arrays = self._live(compiled(walk, *bodies), body, out, length, 3 if options.judged else 1)
+        self._arrays = self._live(compiled(walk, *bodies), body, out, length, 2 if options.judged else 1)
         # Writing to a memory view takes half the time of writing to an array.
         self._call: Any = self._arrays.call.data
         self._report: Any = self._arrays.report.data
@@ -238,7 +236,7 @@ class LiveFilter:
             missing_now=np.zeros(len(sensors)),
             innovation=self._innovation,
             weight=self._weight,
-            report=np.zeros(6, np.int64),
+            report=np.zeros(5, np.int64),
         )
 
     # ---------------------------------------------------------------------------------------------------------------------- updates
@@ -421,18 +419,7 @@ class LiveFilter:
 
     def _take_report(self) -> None:
         """Store the events that the gate reports."""
-        recovered, locked = self._report[1], self._report[2]
-        self._closed += self._reported(self._recoveries[:recovered], self._slots[:0])
-        opened = self._judge.counters[:, gate_rules.REPORTED]
-        for k, row in enumerate(self._lock_outs[:locked]):
-            sensor = int(row[2])
-            self._closed += self._reported(self._recoveries[:0], self._slots[sensor : sensor + 1])
-            self._slots[sensor] = row
-            if opened[sensor] == k:  # if it continues, the kernel finds it in that row
-                opened[sensor] = len(self._weight) + sensor
-
-    def _reported(self, recoveries: Array, lock_outs: Array) -> tuple[Event, ...]:
-        return tuple(gate_events(recoveries, lock_outs, tuple(self._sensors)))
+        self._closed += tuple(gate_events(self._events[: self._report[1]], tuple(self._sensors)))
 
     # ------------------------------------------------------------------------------------------------------------------ the estimate
 
@@ -466,8 +453,7 @@ class LiveFilter:
     @property
     def events(self) -> tuple[Event, ...]:
         """Recoveries and lock-outs up to now, in order of time."""
-        events = self._closed + self._reported(self._recoveries[:0], self._slots)
-        return tuple(sorted(events, key=lambda event: event.start))
+        return forward.in_order([*self._closed, *last_lock_outs(self._judge.counters, self._sensors)])
 
     @property
     def refused(self) -> dict[str, int]:

@@ -117,7 +117,7 @@ class Body(NamedTuple):
     counters: np.ndarray
     """Counters of each sensor (sensors, ``COUNTERS``); at return, their final values."""
     memory: np.ndarray
-    """Counters of the candidate (``MEMORY``,); at return, final values. Initially zero, except ``PASSES`` = 1 and ``REPORTED`` = −1."""
+    """Counters of the candidate (``MEMORY``,); at return, final values. Initially zero, except ``PASSES`` = 1."""
 
 
 class Outputs(NamedTuple):
@@ -126,23 +126,21 @@ class Outputs(NamedTuple):
     form: FilterOutputs
     weight: np.ndarray
     """Weight of each measurement (events,), by place; 0: refused."""
-    recoveries: np.ndarray
-    """(rows, 4): time, sensor, time of the first refusal and number of consecutive refusals of each recovery."""
-    lock_outs: np.ndarray
-    """(rows, 4): times of the first and last refusal, sensor, number of refusals; 0 for a lock-out that is reported as a recovery."""
+    events: np.ndarray
+    """(rows, 5): kind, sensor, start, end and number of refusals of each recovery and lock-out, except lock-outs in the counters."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ the body of the walk
 
 
 def begin(body):
-    """Return the numbers of states, lock-outs, recoveries and segments, and whether a measurement was too precise."""
+    """Return the numbers of states, events and segments, and whether a measurement was too precise."""
     # From an array, and not literals: numba would compile the body for that type too.
     none = 0 * len(body.memory)
     running = none + 1
     if body.memory[CANDIDATE] > 0.0:
         running = none + 2
-    return running, none, none, none, running < 0
+    return running, none, none, running < 0
 
 
 def largest_turn(running, part, dt, body):
@@ -160,20 +158,21 @@ def longest_step(state, part, dt, body):
 
 def predict(state, part, dt, body, out):
     """Propagate the filter and the candidate."""
-    running, lock_outs, recoveries, segments, lost = state
+    running, events, segments, lost = state
     form = body.form
     if segments < len(out.form.segments):
         store_segment(out.form.segments, segments, dt, part, form.x[0], form.P[0])
         segments += 1
     for i in range(running):
         propagate_row(form, i, part, dt)
-    return running, lock_outs, recoveries, segments, lost
+    return running, events, segments, lost
 
 
 def update(state, e, now, measured, body, out):
     """Test a measurement with the filter and the candidate, if there is one, and update."""
-    running, lock_outs, recoveries, segments, lost = state
+    running, events, segments, lost = state
     form, options, memory, counters = body.form, body.options, body.memory, body.counters
+    recovery, limit = options.recovery, options.lock_out
     place = measured.place[e]
     sensor = measured.sensor[e]
     degrees = degrees_of_freedom(measured.series[sensor, KIND])
@@ -188,9 +187,7 @@ def update(state, e, now, measured, body, out):
             lost = lost or far
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
-            lock_outs, start = judge_filter(
-                outcome, now, sensor, options.recovery, options.lock_out, counters, memory, out.lock_outs, lock_outs
-            )
+            events, start = judge_filter(outcome, now, sensor, recovery, limit, counters, memory, out.events, events)
             if start:
                 start_candidate(form, memory, now, options.attitude_sigma, body.restart)
                 running = 2
@@ -203,13 +200,12 @@ def update(state, e, now, measured, body, out):
                 running = 1
             elif verdict == TOO_NARROW:
                 widen(form, memory)
-            if verdict != DROPPED and takes_over(sensor, options.recovery, counters, memory):
-                recover(now, sensor, options.lock_out, counters, memory, out.recoveries[recoveries], out.lock_outs)
-                recoveries += 1
+            if verdict != DROPPED and takes_over(sensor, recovery, counters, memory):
+                events = recover(now, sensor, limit, counters, memory, out.events, events)
                 become(form)
                 running = 1
         i += 1
-    return running, lock_outs, recoveries, segments, lost
+    return running, events, segments, lost
 
 
 def keep(state, row, e, body, out):
@@ -220,15 +216,15 @@ def keep(state, row, e, body, out):
 
 def stopped(state):
     """Return whether a measurement was too precise for double precision."""
-    return state[4]
+    return state[3]
 
 
 def finish(state, row, e, body):
-    """Return the numbers of segments (−1: a measurement was too precise), recoveries and lock-outs."""
-    _, lock_outs, recoveries, segments, lost = state
+    """Return the numbers of segments (−1: a measurement was too precise) and events."""
+    _, events, segments, lost = state
     if lost:
         segments = -1
-    return segments, recoveries, lock_outs
+    return segments, events
 
 
 # ---------------------------------------------------------------------------------------------------------- one measurement, tested first

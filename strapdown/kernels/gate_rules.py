@@ -71,9 +71,13 @@ NUMBER = 2
 """Refusals since the excess was zero, the time of the first and of the last of them, s."""
 FIRST = 3
 LAST = 4
-REPORTED = 5
-"""Row of ``lock_outs`` in which they are reported; −1: not reported."""
+LOCKED_OUT = 5
+"""Whether the excess has exceeded the limit: these refusals are a lock-out."""
 COUNTERS = 6
+
+# Kinds of events.
+RECOVERY = 0
+LOCK_OUT = 1
 
 # Outcomes for a candidate.
 DROPPED = 0
@@ -81,11 +85,11 @@ FOLLOWED = 1
 TOO_NARROW = 2
 
 
-def judge_filter(outcome, now, sensor, recovery, limit, counters, memory, lock_outs, reported):
-    """Count the filter's outcome of a measurement; return the number of lock-outs reported, and whether a candidate must start.
+def judge_filter(outcome, now, sensor, recovery, limit, counters, memory, events, number):
+    """Count the filter's outcome of a measurement; return the number of events, and whether a candidate must start.
 
-    A lock-out is reported when the refusals of a sensor exceed its acceptances by more than ``limit``, in a row of ``lock_outs``: times of
-    the first and last refusal, sensor, number of refusals. ``recovery``: refusals in a row that start a candidate; 0: never.
+    Refusals of a sensor that exceed its acceptances by more than ``limit`` are a lock-out. It becomes an event when it has ended and others
+    begin; the last one of each sensor remains in the counters. ``recovery``: refusals in a row that start a candidate; 0: never.
     """
     counts = counters[sensor]
     if outcome == ACCEPTED:
@@ -93,29 +97,32 @@ def judge_filter(outcome, now, sensor, recovery, limit, counters, memory, lock_o
         counts[EXCESS] = max(counts[EXCESS] - 1.0, 0.0)
         memory[TRUSTED] += 1.0
     if outcome != REFUSED:
-        return reported, False
+        return number, False
     counts[IN_A_ROW] += 1.0
     if counts[EXCESS] == 0.0:
+        number = report_lock_out(sensor, counts, events, number)
         counts[NUMBER] = 0.0
         counts[FIRST] = now
-        counts[REPORTED] = -1.0
     counts[EXCESS] = min(counts[EXCESS] + 1.0, 2.0 * limit)
     counts[NUMBER] += 1.0
     counts[LAST] = now
-    if counts[EXCESS] > limit and counts[REPORTED] < 0.0:
-        counts[REPORTED] = reported
-        reported += 1
-    if counts[REPORTED] >= 0.0:
-        row = lock_outs[int(counts[REPORTED])]
-        row[0] = counts[FIRST]
-        row[1] = now
-        row[2] = sensor
-        row[3] = counts[NUMBER]
+    if counts[EXCESS] > limit:
+        counts[LOCKED_OUT] = 1.0
     if recovery == 0 or memory[CANDIDATE] > 0.0:
-        return reported, False
+        return number, False
     if memory[TRUSTED] >= FORGOTTEN * recovery:
         memory[LEVEL] = 0.0
-    return reported, True
+    return number, True
+
+
+def report_lock_out(sensor, counts, events, number):
+    """Report the lock-out in the counters of a sensor, if there is one; return the number of events."""
+    if counts[LOCKED_OUT] == 0.0:
+        return number
+    row = events[number]
+    row[0], row[1], row[2], row[3], row[4] = LOCK_OUT, sensor, counts[FIRST], counts[LAST], counts[NUMBER]
+    counts[LOCKED_OUT] = 0.0
+    return number + 1
 
 
 def restart_width(memory):
@@ -218,20 +225,19 @@ def takes_over(sensor, recovery, counters, memory):
     return counters[sensor, IN_A_ROW] >= recovery and memory[HITS] >= recovery
 
 
-def recover(now, sensor, limit, counters, memory, row, lock_outs):
-    """Report a recovery in ``row`` (4,): time, sensor, time of the first refusal, refusals in a row; reset the counters.
+def recover(now, sensor, limit, counters, memory, events, number):
+    """Report a recovery, from the first refusal, and reset the counters; return the number of events.
 
-    It replaces the short lock-outs that it ends: their number of refusals is set to zero.
+    It replaces the short lock-outs that it ends.
     """
-    row[0] = now
-    row[1] = sensor
-    row[2] = min(memory[SINCE], counters[sensor, FIRST])
-    row[3] = counters[sensor, IN_A_ROW]
+    row, first = events[number], min(memory[SINCE], counters[sensor, FIRST])
+    row[0], row[1], row[2], row[3], row[4] = RECOVERY, sensor, first, now, counters[sensor, IN_A_ROW]
+    number += 1
     for s in range(len(counters)):
-        if counters[s, REPORTED] >= 0.0 and counters[s, NUMBER] <= 2.0 * limit and counters[s, EXCESS] > 0.0:
-            lock_outs[int(counters[s, REPORTED]), 3] = 0.0
+        if counters[s, NUMBER] > 2.0 * limit or counters[s, EXCESS] == 0.0:
+            number = report_lock_out(s, counters[s], events, number)
         for j in range(COUNTERS):
             counters[s, j] = 0.0
-        counters[s, REPORTED] = -1.0
     step_aside(memory)
     memory[PASSES] = WIDE_PASSES
+    return number

@@ -74,10 +74,10 @@ class Live(NamedTuple):
     innovation: np.ndarray
     weight: np.ndarray
     report: np.ndarray
-    """Three numbers that the walk returned, number of measurements of the call, of the last interval, and sensor of a refused one (6,)."""
+    """Two numbers that the walk returned, number of measurements of the call, of the last interval, and sensor of a refused one (5,)."""
 
 
-NUMBER, LAST, CULPRIT = 3, 4, 5
+NUMBER, LAST, CULPRIT = 2, 3, 4
 """Places in ``report``."""
 
 
@@ -215,7 +215,7 @@ def process(live, end, count, intervals):
             live.counts[s, 1] += 1.0
         elif live.weight[k] == 0.0:
             live.counts[s, 0] += 1.0
-    return REPORT if live.report[1] > 0 or live.report[2] > 0 else DONE
+    return REPORT if live.report[1] > 0 else DONE
 
 
 def write_measurement(live, k):
