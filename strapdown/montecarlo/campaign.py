@@ -3,9 +3,9 @@
 The file is HDF5 and always complete: each version is written to a temporary file and renamed. A reader, during the campaign or after it was
 killed, finds the statistics of the runs finished until then. The file holds sums, not runs, so its size does not depend on their number.
 
-The statistics are a left fold over whole chunks in the order of their runs, which depends only on plan, machine and chunk. The group
-``resume`` holds what is needed to continue: chunks finished before earlier ones, ``resume/<first run>``, and, if the last chunk is short,
-the fold without it, ``resume/whole``. So an extended campaign is bitwise identical to one that was as long from the start.
+The statistics are a left fold over chunks in the order of their runs, which depends only on plan, machine and chunk. If the last chunk is
+short, the group ``resume/whole`` holds the fold without it, so that an extended campaign is bitwise identical to one that was as long from
+the start.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
 from strapdown.montecarlo import verdicts
-from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
+from strapdown.montecarlo.engine import MACHINES, Identity, Work, Workers, choose, chunks_of, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
@@ -106,7 +106,7 @@ class Campaign(Listed):
     runs : int
         Total number of runs.
     statistics : Statistics or None
-        Statistics of the finished runs from the first without a gap; None if there are none.
+        Statistics of the finished runs, from the first; None if there are none.
     version : str, optional
         Version of this package that computed it. Default: the running one.
     sources : str, default ""
@@ -115,6 +115,8 @@ class Campaign(Listed):
         Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`).
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
+    whole : Statistics, optional
+        Statistics without a short last chunk, with which a longer campaign continues.
     """
 
     plan: Plan
@@ -127,6 +129,7 @@ class Campaign(Listed):
     sources: str = ""
     arithmetic: str = ""
     seconds: float = 0.0
+    whole: Statistics | None = field(default=None, repr=False)
 
     def listing(self) -> Table:
         """Return the statistics of the finished runs as a table."""
@@ -178,14 +181,19 @@ class Campaign(Listed):
     @property
     def extent(self) -> str:
         """Numbers of runs, seed and machine, in words."""
-        done = 0 if self.statistics is None else self.statistics.runs
+        done = self.finished_runs
         number = f"{done} run{'' if done == 1 else 's'}" if self.finished else f"{done} of {self.runs} runs"
         return f"{number} of {self.plan.scenario.duration:g} s, seed {self.plan.seed}, machine {self.machine}"
 
     @property
+    def finished_runs(self) -> int:
+        """Number of runs in the statistics."""
+        return 0 if self.statistics is None else self.statistics.runs
+
+    @property
     def finished(self) -> bool:
         """Whether the statistics contain all runs."""
-        return self.statistics is not None and self.statistics.runs == self.runs
+        return self.finished_runs == self.runs
 
 
 def with_filter(held: Campaign, own: Own, path: Path) -> Campaign:
@@ -197,43 +205,6 @@ def with_filter(held: Campaign, own: Own, path: Path) -> Campaign:
             "the scenario and another file"
         )
     return replace(held, plan=replace(held.plan, setup=replace(setup, estimator=own)))
-
-
-@dataclass
-class _Progress:
-    """Finished chunks: the fold over whole chunks from the first, and chunks finished before earlier ones, by first run."""
-
-    whole: Statistics | None
-    early: dict[int, Statistics]
-    chunk: int
-
-    @property
-    def merged(self) -> int:
-        """Number of runs in the fold."""
-        return 0 if self.whole is None else self.whole.runs
-
-    def take(self, first_run: int, part: Statistics) -> None:
-        """Add a finished chunk."""
-        self.early[first_run] = part
-        while self.merged in self.early and self.early[self.merged].runs == self.chunk:
-            first = self.merged
-            self.whole = self.early[first] if self.whole is None else merge(self.whole, self.early[first])
-            del self.early[first]
-
-    @property
-    def statistics(self) -> Statistics | None:
-        """Statistics of all runs from the first without a gap, a short last chunk included."""
-        last = self.early.get(self.merged)
-        if last is None:
-            return self.whole
-        return last if self.whole is None else merge(self.whole, last)
-
-    def missing(self, runs: int) -> Chunks:
-        """Return the chunks left to compute; a short last chunk is dropped if it is to be longer now."""
-        for first in [first for first, part in self.early.items() if part.runs != min(self.chunk, runs - first)]:
-            del self.early[first]
-        left = range(self.merged, runs, self.chunk)
-        return Chunks([first for first in left if first not in self.early] if self.early else left, runs, self.chunk)
 
 
 def run(
@@ -289,38 +260,30 @@ def run(
         )
     engine = choose(plan, machine)
     with locked(target), _asked_to_stop() as stop_if_asked:
-        held = _stored(target) if resume and target.exists() else None
-        if held is None:
-            size = MACHINES[engine.machine].CHUNK if chunk is None else count("chunk", chunk)
-            state, before = _Progress(None, {}, size), 0.0
-        else:
-            stored, state = held
-            size, before = stored.chunk, stored.seconds
-            _need_same(target, stored, plan, engine.machine, size if chunk is None else count("chunk", chunk), runs)
-        begun = time.perf_counter()
-
-        def write() -> Campaign:
-            now = Campaign(
-                plan=plan,
-                machine=engine.machine,
-                reason=engine.reason,
-                chunk=size,
-                runs=runs,
-                statistics=None if state.statistics is None else replace(state.statistics, plan=plan),
-                **identity()._asdict(),
-                seconds=before + time.perf_counter() - begun,
-            )
-            _write(target, now, state, table)
-            return now
-
-        work = Work(plans=(plan,), machine=engine.machine)
+        held = read(target) if resume and target.exists() else None
+        default = MACHINES[engine.machine].CHUNK if held is None else held.chunk
+        size = default if chunk is None else count("chunk", chunk)
+        if held is not None:
+            _need_same(target, held, plan, engine.machine, size, runs)
+        whole = None if held is None else held.whole
+        start = Campaign(
+            plan=plan,
+            machine=engine.machine,
+            reason=engine.reason,
+            chunk=size,
+            runs=runs,
+            statistics=held.statistics if held is not None and held.finished_runs == runs else whole,
+            whole=whole,
+            **identity()._asdict(),
+            seconds=0.0 if held is None else held.seconds,
+        )
         advance = progress or (lambda number: None)
 
         def advanced(number: int) -> None:
             advance(number)
             stop_if_asked()
 
-        return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, advanced)
+        return _compute(start, target, table, in_threads(threads) if workers is None else workers, advanced)
 
 
 @contextlib.contextmanager
@@ -350,24 +313,32 @@ def _asked_to_stop() -> Iterator[Callable[[], None]]:
 
 
 def _compute(
-    work: Work,
-    state: _Progress,
-    runs: int,
-    workers: Workers,
-    write: Callable[[], Campaign],
-    progress: Callable[[int], None],
+    campaign: Campaign, path: Path, table: Mapping[str, Any], workers: Workers, progress: Callable[[int], None]
 ) -> Campaign:
     """Compute the missing chunks; write at once, at intervals, and at the end or an exception; return the last written state."""
-    missing = state.missing(runs)
-    if done := runs - sum(n for _, n in missing):
-        progress(done)
+    statistics, whole, begun = campaign.statistics, campaign.whole, time.perf_counter()
+
+    def write() -> Campaign:
+        now = replace(
+            campaign,
+            statistics=None if statistics is None else replace(statistics, plan=campaign.plan),
+            whole=whole,
+            seconds=campaign.seconds + time.perf_counter() - begun,
+        )
+        _write(path, now, table)
+        return now
+
+    if campaign.finished_runs:
+        progress(campaign.finished_runs)
     written = write()  # fails before anything is computed if the file cannot be written
     due, unwritten = 0.0, False
+    work = Work(plans=(campaign.plan,), machine=campaign.machine)
     try:
-        for place, (part,) in workers(work, missing):
-            state.take(missing[place][0], part)
+        for (part,) in workers(work, chunks_of(campaign.runs, campaign.chunk, campaign.finished_runs)):
+            statistics = part if whole is None else merge(whole, part)
+            whole = statistics if part.runs == campaign.chunk else whole
             unwritten = True
-            progress(missing[place][1])
+            progress(part.runs)
             if (now := time.perf_counter()) >= due:
                 written, unwritten = write(), False
                 due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
@@ -391,9 +362,10 @@ def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: in
                 f"{target} is of another campaign; {name} is {there.get(name) or 'not given'} there and {wanted.get(name) or 'not given'} "
                 f"here; {remedy}, or choose another file"
             )
-    finished = 0 if held.statistics is None else held.statistics.runs
-    if runs < finished:
-        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; give more runs")
+    if runs < held.finished_runs:
+        raise InputError(
+            f"{target} holds {held.finished_runs} runs already, more than the {runs} wanted; give more runs"
+        )
 
 
 def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
@@ -413,7 +385,7 @@ def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 # -------------------------------------------------------------------------------------------------------------------------- file
 
 
-def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str, Any]) -> None:
+def _write(path: Path, campaign: Campaign, table: Mapping[str, Any]) -> None:
     import h5py
     import numba
 
@@ -443,17 +415,14 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
             "reason": campaign.reason,
             "chunk": campaign.chunk,
             "runs": campaign.runs,
-            "finished_runs": 0 if campaign.statistics is None else campaign.statistics.runs,
+            "finished_runs": campaign.finished_runs,
             "seconds": campaign.seconds,
         }
         set_attributes(file, attributes)
         if campaign.statistics is not None:
             _put_statistics(file.create_group("statistics"), campaign.statistics)
-        folded = campaign.statistics is not None and campaign.statistics.runs == state.merged
-        if state.early and state.whole is not None and not folded:
-            _put_statistics(file.create_group("resume/whole"), state.whole)
-        for first_run, part in sorted(state.early.items()):
-            _put_statistics(file.create_group(f"resume/{first_run}"), part)
+        if campaign.whole is not None and campaign.whole.runs < campaign.finished_runs:
+            _put_statistics(file.create_group("resume/whole"), campaign.whole)
 
 
 def _put_statistics(group: Any, statistics: Statistics) -> None:
@@ -512,10 +481,7 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     Campaign
         The campaign with the statistics of the finished runs.
     """
-    return _stored(Path(path))[0]
-
-
-def _stored(path: Path) -> tuple[Campaign, _Progress]:
+    path = Path(path)
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
         if attributes.get("kind") != KIND:
@@ -527,28 +493,19 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
         plan = from_table(reading.from_json(attributes["plan"], f"{path}: plan"))
         if attributes["digest"] != plan.digest:
             raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign again")
-        campaign = Campaign(
+        chunk = count("chunk", attributes["chunk"])
+        statistics = _statistics_of(file["statistics"], plan) if "statistics" in file else None
+        whole = statistics if statistics is not None and statistics.runs % chunk == 0 else None
+        return Campaign(
             plan=plan,
             machine=one_of("machine", attributes["machine"], MACHINES),
             reason=str(attributes["reason"]),
-            chunk=count("chunk", attributes["chunk"]),
+            chunk=chunk,
             runs=count("runs", attributes["runs"]),
-            statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
+            statistics=statistics,
+            whole=_statistics_of(file["resume/whole"], plan) if "resume/whole" in file else whole,
             version=str(attributes["version"]),
             sources=str(attributes["sources"]),
             arithmetic=str(attributes["arithmetic"]),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
-        early = file.get("resume", {})
-        return campaign, _Progress(
-            _statistics_of(early["whole"], plan) if "whole" in early else _whole(campaign, early),
-            {int(name): _statistics_of(group, plan) for name, group in early.items() if name != "whole"},
-            campaign.chunk,
-        )
-
-
-def _whole(campaign: Campaign, early: Mapping[str, Any]) -> Statistics | None:
-    """Return the fold over whole chunks if the file has no ``resume/whole``: the statistics, unless they are one short chunk."""
-    if campaign.statistics is None or "0" in early:
-        return None
-    return campaign.statistics

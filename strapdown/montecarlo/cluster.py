@@ -1,6 +1,6 @@
 """Chunks on other processes and hosts, through Dask distributed (the extra ``cluster``).
 
-Chunks are bitwise identical on processors of one kind (:func:`strapdown.montecarlo.engine.arithmetic`); Dask reassigns the chunk of a lost
+Chunks are bitwise identical on processors of one kind (:func:`strapdown.montecarlo.engine.arithmetic`); Dask reassigns the chunks of a lost
 worker.
 
 Security: client, scheduler and workers exchange pickles, so each can run any code on the others. Use only a scheduler that you trust with
@@ -14,15 +14,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
-from queue import Empty, SimpleQueue
+from threading import Event
 from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
 from strapdown.files.extras import library
-from strapdown.montecarlo.engine import Chunks, Identity, Parts, Window, Work, Workers, identity
+from strapdown.montecarlo.engine import Identity, Parts, Work, Workers, identity, in_order
 
 __all__ = [
     "dask_client",
@@ -85,7 +85,7 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
 def on_dask(client: Any) -> Workers:
     """Return workers that compute chunks of runs through a Dask client.
 
-    Workers may join and leave during the work. At most two chunks per thread are submitted ahead.
+    Workers may join and leave during the work.
 
     Parameters
     ----------
@@ -104,30 +104,19 @@ def on_dask(client: Any) -> Workers:
     """
     distributed = library("distributed", "a cluster of workers", "cluster")
 
-    def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
+    def work_through(work: Work, chunks: Iterable[tuple[int, int]]) -> Iterator[Parts]:
         payload = distributed.protocol.pickle.dumps(work)  # the user's classes and functions are pickled by value
         _need_workers(client, distributed)
-        window = Window(len(chunks), 2 * max(1, sum(client.nthreads().values())))
-        places: dict[Any, int] = {}
-        finished: SimpleQueue[Any] = SimpleQueue()
-        try:
-            while window.open:
-                while (place := window.begin()) is not None:
-                    future = client.submit(_chunk, payload, *chunks[place], identity(), pure=False)
-                    places[future] = place
-                    future.add_done_callback(finished.put)
-                try:
-                    future = finished.get(timeout=WORKERS_SECONDS)
-                except Empty:
-                    _need_workers(client, distributed)
-                    continue
-                place = places.pop(future)
-                parts = _result(distributed, client, future, chunks[place])
-                window.finish(place)
-                yield place, parts
-        finally:
-            with contextlib.suppress(distributed.comm.CommClosedError):
-                client.cancel(list(places))
+
+        def submit(first_run: int, runs: int) -> tuple[str, Any, Event]:
+            future, done = client.submit(_chunk, payload, first_run, runs, identity(), pure=False), Event()
+            future.add_done_callback(lambda _: done.set())
+            return f"runs {first_run} to {first_run + runs - 1}", future, done
+
+        for runs, future, done in in_order(chunks, submit, max(1, sum(client.nthreads().values()))):
+            while not done.wait(WORKERS_SECONDS):
+                _need_workers(client, distributed)
+            yield _result(distributed, client, future, runs)
 
     return work_through
 
@@ -152,9 +141,8 @@ def _lost(client: Any, error: object) -> InputError:
     )
 
 
-def _result(distributed: Any, client: Any, future: Any, chunk: tuple[int, int]) -> Parts:
+def _result(distributed: Any, client: Any, future: Any, runs: str) -> Parts:
     """Return what a worker computed, if it is of the same identity."""
-    runs = f"runs {chunk[0]} to {sum(chunk) - 1}"
     try:
         there, parts = future.result()
     except distributed.KilledWorker:

@@ -6,12 +6,14 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Thread
-from typing import Any, NamedTuple
+from threading import Event, Thread
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -31,7 +33,7 @@ MACHINES: dict[str, Any] = {lanes.NAME: lanes, scalar.NAME: scalar}
 """Machines by name, the fast one first: modules as described in :mod:`strapdown.montecarlo.statistics`."""
 
 AHEAD = 4
-"""Maximum number of chunks per worker ahead of the first unfinished one; bounds the memory."""
+"""Maximum number of chunks per worker that are submitted and not yet merged; bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,30 +139,9 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     return replace(replayed, record=replace(record, origin=origin), estimate=estimate)
 
 
-@dataclass(frozen=True)
-class Chunks:
-    """Chunks as (first run, runs), computed on access, because a list would grow with the number of runs."""
-
-    firsts: Sequence[int]
-    """First run of each chunk."""
-    runs: int
-    """Total number of runs."""
-    chunk: int
-
-    def __len__(self) -> int:
-        return len(self.firsts)
-
-    def __getitem__(self, place: int) -> tuple[int, int]:
-        first = self.firsts[place]
-        return first, min(self.chunk, self.runs - first)
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        return (self[place] for place in range(len(self)))
-
-
-def chunks_of(runs: int, chunk: int) -> Chunks:
-    """Return the chunks of ``runs`` runs."""
-    return Chunks(range(0, runs, chunk), runs, chunk)
+def chunks_of(runs: int, chunk: int, first: int = 0) -> Iterator[tuple[int, int]]:
+    """Yield the chunks of the runs ``first`` to ``runs`` − 1 as (first run, number of runs)."""
+    return ((start, min(chunk, runs - start)) for start in range(first, runs, chunk))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,85 +159,57 @@ class Work:
         return tuple(MACHINES[self.machine].run_chunk(plan, first_run, runs) for plan in self.plans)
 
 
-Workers = Callable[[Work, Chunks], Iterator[tuple[int, Parts]]]
-"""Function that computes chunks and yields (index, result) in the order in which they finish, at most :data:`AHEAD` chunks per worker
-ahead of the first unfinished one."""
+Workers = Callable[[Work, Iterable[tuple[int, int]]], Iterator[Parts]]
+"""Function that computes chunks and yields their statistics in the order of the chunks."""
+
+Submitted = TypeVar("Submitted")
 
 
-class Window:
-    """Order in which chunks are started, with a limited number ahead of the first unfinished one."""
-
-    def __init__(self, chunks: int, workers: int) -> None:
-        self._next, self._end, self._ahead = 0, chunks, AHEAD * workers
-        self._running: set[int] = set()
-        self._most = workers
-
-    def begin(self) -> int | None:
-        """Return the index of the next chunk to start; None if there is none now."""
-        first = min(self._running, default=self._next)
-        if self._next >= self._end or len(self._running) >= self._most or self._next >= first + self._ahead:
-            return None
-        self._running.add(self._next)
-        self._next += 1
-        return self._next - 1
-
-    def finish(self, place: int) -> None:
-        """Mark a chunk as finished."""
-        self._running.remove(place)
-
-    @property
-    def open(self) -> bool:
-        """Whether any chunk is unfinished."""
-        return bool(self._running) or self._next < self._end
+def in_order(
+    chunks: Iterable[tuple[int, int]], submit: Callable[[int, int], Submitted], workers: int
+) -> Iterator[Submitted]:
+    """Yield what ``submit`` returns for each chunk, in order; at most :data:`AHEAD` per worker are submitted and not yet yielded."""
+    waiting: deque[Submitted] = deque()
+    for chunk in chunks:
+        waiting.append(submit(*chunk))
+        if len(waiting) == AHEAD * workers:
+            yield waiting.popleft()
+    while waiting:
+        yield waiting.popleft()
 
 
 def in_threads(threads: int | None = None) -> Workers:
     """Return workers that are threads of this process. Default: one per core."""
     number = os.cpu_count() or 1 if threads is None else count("threads", threads)
 
-    def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
-        tasks: SimpleQueue[int | None] = SimpleQueue()
-        results: SimpleQueue[tuple[int, Parts | BaseException]] = SimpleQueue()
+    def work_through(work: Work, chunks: Iterable[tuple[int, int]]) -> Iterator[Parts]:
+        tasks: SimpleQueue[tuple[Future[Parts], int, int] | None] = SimpleQueue()
+        stopped = Event()
 
         def worker_loop() -> None:
-            while (place := tasks.get()) is not None:
+            while (task := tasks.get()) is not None and not stopped.is_set():
+                future, *chunk = task
                 try:
-                    results.put((place, work(*chunks[place])))
+                    future.set_result(work(*chunk))
                 except BaseException as error:
-                    results.put((place, error))
+                    future.set_exception(error)
 
-        workers = [Thread(target=worker_loop, daemon=True) for _ in range(min(number, len(chunks)))]
-        for thread in workers:
-            thread.start()
-        window = Window(len(chunks), len(workers))
+        def submit(first_run: int, runs: int) -> Future[Parts]:
+            future: Future[Parts] = Future()
+            tasks.put((future, first_run, runs))
+            return future
+
+        for _ in range(number):  # daemons: Python waits for the threads of a ThreadPoolExecutor, also after Ctrl-C
+            Thread(target=worker_loop, daemon=True).start()
         try:
-            while window.open:
-                while (place := window.begin()) is not None:
-                    tasks.put(place)
-                done, result = results.get()
-                if isinstance(result, BaseException):
-                    raise result
-                window.finish(done)
-                yield done, result
+            for future in in_order(chunks, submit, number):
+                yield future.result()
         finally:
-            for _ in workers:
+            stopped.set()
+            for _ in range(number):
                 tasks.put(None)
 
     return work_through
-
-
-def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
-    """Return the statistics of all chunks, which come in any order, merged in the order of their indices."""
-    early: dict[int, Parts] = {}
-    total: Parts = ()
-    place = 0
-    for number, parts in finished:
-        early[number] = parts
-        while place in early:
-            following = early.pop(place)
-            total = tuple(merge(a, b) for a, b in zip(total, following, strict=True)) if total else following
-            place += 1
-    return total
 
 
 def run_plan(
@@ -347,13 +300,9 @@ def run(
 
 
 def _run(work: Work, runs: int, chunk: int, workers: Workers, progress: Callable[[int], None] | None) -> Parts:
-    chunks = chunks_of(runs, chunk)
-
-    def counted() -> Iterator[tuple[int, Parts]]:
-        for place, parts in workers(work, chunks):
-            if progress is not None:
-                progress(chunks[place][1])
-            yield place, parts
-
-    parts = merged_in_order(counted())
-    return tuple(replace(part, plan=plan) for part, plan in zip(parts, work.plans, strict=True))
+    total: Parts = ()
+    for parts in workers(work, chunks_of(runs, chunk)):
+        total = tuple(map(merge, total, parts)) if total else parts
+        if progress is not None:
+            progress(parts[0].runs)
+    return tuple(replace(part, plan=plan) for part, plan in zip(total, work.plans, strict=True))

@@ -199,7 +199,7 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         **{name: np.zeros(shape, np.int64) for name, shape in counts.items()},
     )
     held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=statistics)
-    campaign._write(path, held, campaign._Progress(statistics, {}, 4), plan.to_table())
+    campaign._write(path, held, plan.to_table())
 
 
 _TRACKER = """[[sensors]]
