@@ -320,7 +320,7 @@ def test_the_command_computes_prints_and_writes(command):
     assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
-        "NEES attitude",
+        "ANEES attitude, mean",
         "NIS sun sensor",
         "NIS star",
         "Worst runs",
@@ -331,7 +331,7 @@ def test_the_command_computes_prints_and_writes(command):
     held = campaign.read("short-montecarlo.h5")
     assert report["runs"] == 30
     assert report["digest"] == held.plan.digest
-    assert report["nees"]["attitude"]["anees"] == pytest.approx(held.statistics.anees[4:, 1].mean(), rel=0.2)
+    assert report["anees"]["attitude"] == pytest.approx(held.statistics.anees[4:, 1].mean(), rel=0.2)
     expected = montecarlo.summary(held.statistics)
     assert report["judgement"]["verdict"] == "cannot tell"
     assert {name: report[name] for name in expected} == json.loads(json.dumps(expected))

@@ -206,7 +206,7 @@ def test_a_run_that_fails_is_counted_reported_and_left_out(monkeypatch):
     assert not summary["consistent"]
     assert summary["worst_runs"][0] == {"run": 2, "largest_nees": None}
     early = montecarlo.summary(total, epochs=np.array([1, 2]))  # before it failed
-    assert all(part["consistent"] for part in (*early["nees"].values(), *early["nis"]))
+    assert not any(finding["rejected"] for finding in early["judgement"]["findings"])
     assert not early["consistent"]
 
 
@@ -231,21 +231,21 @@ def test_measurements_that_a_gate_refuses_are_counted_apart(monkeypatch):
     assert np.array_equal(total.sensor_nis_sum[0], plain.sensor_nis_sum[0])
 
 
-def test_summary_bounds_are_those_that_decide():
+def test_bounds_are_those_that_decide():
     """The level is shared by the ten tests of the verdict, none of which rejects, and within each by its two epochs."""
     sums, epochs = scalar.run_chunk(PLAN, 0, 3), np.array([2, 4])
-    summary = montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)
     judgement = sums.judge(epochs=epochs, confidence_level=0.95)
+    assert montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)["judgement"] == judgement.summary()
+    bounds = {(finding.name, finding.of): (finding.low, finding.high) for finding in judgement.findings}
     assert len(judgement.findings) == 10
     assert not any(finding.rejected for finding in judgement.findings)
     single = 0.05 / 10.0
     low, high = scipy.stats.chi2.ppf([0.25 * single, 1.0 - 0.25 * single], 9) / 9.0
-    assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(bounds["ANEES", "bias"], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], 6) / 6.0
-    assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(bounds["NIS", sums.sensors[1]], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], sums.sensor_degrees.sum())
-    bounds = np.array([low, high]) / sums.sensor_degrees.sum()
-    assert np.allclose(sums.nis_bounds(1.0 - single), bounds, rtol=1e-12)
+    assert np.allclose(sums.nis_bounds(1.0 - single), np.array([low, high]) / sums.sensor_degrees.sum(), rtol=1e-12)
 
 
 def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
@@ -270,7 +270,7 @@ def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
     assert findings["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
 
 
-def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
+def test_an_anees_is_outside_its_bounds_where_holm_is_sharper_than_bonferroni():
     """With nine of ten tests rejected the last has the whole level: an ANEES that Bonferroni passes is rejected, and shown outside."""
     sums = scalar.run_chunk(PLAN, 0, 3)
     epochs = np.array([4])
@@ -280,17 +280,11 @@ def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
     nees = sums.nees_sum.copy()
     nees[4] = 18.0 * 50.0, 9.0 * 0.9 * low, 9.0 * 50.0
     odd = replace(sums, nees_sum=nees, sensor_nis_sum=50.0 * sums.sensor_nis_sum, log_nees_sum=sums.log_nees_sum + 30.0)
-    summary = montecarlo.summary(odd, epochs=epochs, confidence_level=0.95)
-    findings = {
-        finding.of: finding
-        for finding in odd.judge(epochs=epochs, confidence_level=0.95).findings
-        if finding.name == "ANEES"
-    }
-    assert findings["attitude"].rejected
-    for subset, part in summary["nees"].items():
-        assert part["consistent"] == (not findings[subset].rejected)
-        assert part["bounds"] == [findings[subset].low, findings[subset].high]
-        assert part["epochs_outside"] == int(findings[subset].rejected)
+    judgement = odd.judge(epochs=epochs, confidence_level=0.95)
+    anees = {finding.of: finding for finding in judgement.findings if finding.name == "ANEES"}
+    assert anees["attitude"].rejected
+    for finding in anees.values():
+        assert (finding.low <= finding.value <= finding.high) is not finding.rejected
 
 
 def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
@@ -298,7 +292,8 @@ def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
     refused = np.arange(10).reshape(2, 5)
     bound = np.tile(np.diag([4.0, 1.0, 1.0, 1.0, 1.0, 1.0]), (7, 1, 1))
     summary = montecarlo.summary(replace(sums, sensor_refused=refused), bound=bound, epochs=np.array([2, 4]))
-    assert [sensor["refused"] for sensor in summary["nis"]] == [10, 35]
+    assert list(summary["refused"].values()) == [10, 35]
+    assert summary["anees"]["bias"] == pytest.approx(sums.anees[[2, 4], 2].mean())
     median = sums.error_quantile(0.5)[-1] * 648000.0 / np.pi
     np.testing.assert_allclose(summary["last_epoch"]["attitude_error_quantile_0.5_arcsec"], median[:3])
     over = summary["rms_over_root_cramer_rao_bound"]
@@ -500,7 +495,8 @@ def test_memory_does_not_grow_with_the_runs():
         return most
 
     peak(4)
-    assert (peak(32) - peak(12)) / 10 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
+    # How many of the four chunks ahead are finished at one time depends on the threads; over 80 chunks they do not matter.
+    assert (peak(172) - peak(12)) / 80 < 0.1 * scalar.run_chunk(PLAN, 0, 2).histogram.nbytes
 
 
 def test_chunks_are_not_listed_and_the_last_may_be_short():

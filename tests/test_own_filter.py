@@ -101,14 +101,14 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert np.isnan(statistics.anees[:, [0, 2]]).all()
     judgement = statistics.judge()
     assert {finding.of for finding in judgement.findings if "NEES" in finding.name} == {"attitude"}
-    assert list(montecarlo.summary(statistics)["nees"]) == ["attitude"]
+    assert list(montecarlo.summary(statistics)["anees"]) == ["attitude"]
     campaign.run(with_filter(attitude_only), tmp_path / "own.h5", runs=12)
     page, numbers = campaigns.report(tmp_path / "own.h5")
     assert list(numbers["anees"]) == ["attitude"]
     assert "bias x" not in page
     assert "nan" not in json.dumps(numbers).lower()
     cli.app(["montecarlo", str(tmp_path / "own.h5")], standalone_mode=False)
-    assert "NEES attitude" in (output := " ".join(capsys.readouterr().out.split()))
+    assert "ANEES attitude, mean" in (output := " ".join(capsys.readouterr().out.split()))
     assert "bias" not in output
 
 

@@ -80,6 +80,7 @@ def montecarlo(
         return None
     new = held is None or target != source or computing.resume or computing.overwrite
     result = _computed(plan, target, source.stem, computing) if new else held
+    ui.show(sd.check(result).listing(), title=ui.EVIDENCE)
     content = result.summary()
     ui.show(*verdicts.tables(content))
     ui.say("Use --replay to examine a run.", *result.words)

@@ -71,7 +71,7 @@ def check(
         judgement, content = _judged_foreign(result, topic or "", foreign, how)
     table, words = judgement.listing(), judgement.words
     if judgement.findings:
-        ui.show(table, title="Statistics of the filter and their bounds for a consistent filter")
+        ui.show(table, title=ui.EVIDENCE)
     else:
         ui.say(*table.notes)
     if record is not None:

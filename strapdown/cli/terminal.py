@@ -73,6 +73,9 @@ _EXTRA: dict[str, Any] = {
 """Options that :func:`command` adds and serves."""
 HDF5 = (".h5", ".hdf5")
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
+EVIDENCE = "Statistics of the filter and their bounds for a consistent filter"
+"""Title of the findings of a judgement, whose own title, the verdict, stands below them."""
+
 OUTPUTS = ("out", "to", "target", "aligned", "json", "tables")
 """Parameters of commands that name files to write; paths in all others are read."""
 STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1, "cannot tell": 3}

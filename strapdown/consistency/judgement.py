@@ -203,21 +203,25 @@ class Judgement(Listed):
                 finding.name,
                 finding.label,
                 finding.value,
+                finding.low,
+                finding.high,
                 f"{figure(finding.low)} to {figure(finding.high)}" if math.isfinite(finding.low) else "",
                 finding.p_value,
                 float(finding.samples),
-                "FAIL" if finding.rejected else "pass",
+                not finding.rejected,
             )
             for finding in self.findings
         ]
         columns = (
-            "statistic",
-            "of",
-            "value",
-            f"{100.0 * self.confidence_level:g} % bounds",
-            Column("p-value", digits=2),
-            "samples",
-            "",
+            Column("statistic", "statistic"),
+            Column("of", "of"),
+            Column("value", "value"),
+            Column(None, "lower_bound"),
+            Column(None, "upper_bound"),
+            Column(f"{100.0 * self.confidence_level:g} % bounds"),
+            Column("p-value", "p_value", digits=2),
+            Column("samples", "samples"),
+            Column("", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
         )
         meaning = (
             f"Bounds, pass and FAIL are for all tests together: a consistent filter fails with at most "
@@ -225,7 +229,7 @@ class Judgement(Listed):
             "correlated samples the effective number is given."
         )
         notes = [*([meaning] if rows else []), *(f"Note: {limit}." for limit in self.limits)]
-        return Table(self.headline, columns, rows, notes, left=2)
+        return Table(self.headline, columns, rows, notes, left=2, name="consistency")
 
     @property
     def words(self) -> str:

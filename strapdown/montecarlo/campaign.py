@@ -143,14 +143,11 @@ class Campaign(Listed):
         Returns
         -------
         dict
-            Plan with its digest, engine, chunk size, version and time; if runs are finished, also ``judgement`` and what
+            Plan with its digest, engine, chunk size, version and time; if runs are finished, also what
             :func:`strapdown.montecarlo.summary` returns.
         """
         statistics = self.statistics
-        own: dict[str, Any] = {}
-        if statistics is not None:
-            judgement = statistics.judge().summary()
-            own = {"judgement": judgement, **verdicts.summary(statistics, bound=verdicts.bound_of(self.plan))}
+        own = {} if statistics is None else verdicts.summary(statistics, bound=verdicts.bound_of(self.plan))
         return {
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
@@ -168,8 +165,7 @@ class Campaign(Listed):
         assert self.statistics is not None
         judgement, filter_setup = self.statistics.judge(), self.plan.setup
         words = [
-            f"{self.extent}, computed in {self.seconds:.3g} s. The verdict combines all {len(judgement.findings)} statistics: a consistent "
-            f"filter passes with {100.0 * judgement.confidence_level:g} %.",
+            f"{self.extent}, computed in {self.seconds:.3g} s.",
             judgement.words,
         ]
         if judgement.verdict == "cannot tell":

@@ -394,10 +394,6 @@ class Statistics(ByValue, Listed):
         return np.asarray(np.where(self._runs_of_state > 0.0, quantile, np.nan))
 
 
-def _at(statistics: Statistics, epochs: Counts, worst: int) -> str:
-    return f"worst of {len(epochs)} epochs ({statistics.time[epochs[worst]]:g} s)"
-
-
 def _anees(statistics: Statistics, epochs: Counts, subset: str, probability: float, failed: int) -> Finding:
     verdict = statistics.verdict(epochs, subset, probability)
     worst = int(np.argmax(np.abs(np.log(np.clip(verdict.mean, 1e-300, 1e300)))))
@@ -410,7 +406,7 @@ def _anees(statistics: Statistics, epochs: Counts, subset: str, probability: flo
         samples=statistics.runs,
         degrees=verdict.degrees,
         epochs=len(epochs),
-        at=_at(statistics, epochs, worst),
+        at=f"mean {figure(float(verdict.mean.mean()))}, worst at {statistics.time[epochs[worst]]:g} s",
         means=error_words(f"the {subset} error at its worst epoch", value)
         if failed == 0
         else f"{failed} of {statistics.runs} runs failed: their {subset} error or covariance is not finite",
@@ -430,7 +426,7 @@ def _log_nees(statistics: Statistics, epochs: Counts, subset: str) -> Finding:
         samples=runs,
         degrees=degrees,
         epochs=len(epochs),
-        at=_at(statistics, epochs, worst),
+        at=f"worst at {statistics.time[epochs[worst]]:g} s",
         means=f"the mean of ln NEES of the {subset} at its worst epoch is {means[worst]:.4g}",
     )
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
-from strapdown.consistency import Finding
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
@@ -47,10 +46,7 @@ def efficiency(statistics: Statistics, bound: Array) -> Array:
 def summary(
     statistics: Statistics, *, epochs: Counts | None = None, confidence_level: float = 0.99, bound: Array | None = None
 ) -> dict[str, Any]:
-    """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
-
-    The bounds are those of the verdict (:meth:`Statistics.judge`): all its tests together reject a consistent filter with at
-    most 1 − ``confidence_level``.
+    """Return the verdict (:meth:`Statistics.judge`) and numbers: mean ANEES, coverage, errors, worst runs; units in the names.
 
     Parameters
     ----------
@@ -70,23 +66,18 @@ def summary(
     """
     rows = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     judgement = statistics.judge(epochs=rows, confidence_level=confidence_level)
-    by_name = {(finding.name, finding.of): finding for finding in judgement.findings}
     covered = statistics.covered[rows]
     table = {
+        "judgement": judgement.summary(),
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
-        "confidence_level": confidence_level,
         "epochs_judged": len(rows),
-        "nees": {subset: _nees(statistics, rows, subset, by_name["ANEES", subset]) for subset in statistics.subsets},
-        "nis": [
-            _nis(statistics, i, by_name["NIS", name])
-            for i, name in enumerate(statistics.sensors)
-            if ("NIS", name) in by_name
-        ],
+        "anees": {subset: statistics.verdict(rows, subset).mean.mean() for subset in statistics.subsets},
+        "refused": dict(zip(statistics.sensors, statistics.sensor_refused.sum(axis=1), strict=True)),
         "coverage": {
             "expected": list(COVERED),
             "attitude": covered[:, :3].mean(axis=(0, 1)),
-            "bias": covered[:, 3:].mean(axis=(0, 1)),
+            **({"bias": covered[:, 3:].mean(axis=(0, 1))} if statistics.has_bias else {}),
         },
         "last_epoch": _last_epoch(statistics),
         **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, rows)}),
@@ -99,67 +90,9 @@ def summary(
     return plain(table)  # type: ignore[no-any-return]
 
 
-def _nees(statistics: Statistics, epochs: Counts, subset: str, finding: Finding) -> dict[str, Any]:
-    """Return the ANEES of a subset of the states at these epochs."""
-    mean = statistics.verdict(epochs, subset).mean
-    return {
-        "anees": mean.mean(),
-        "least": mean.min(),
-        "greatest": mean.max(),
-        "bounds": [finding.low, finding.high],
-        "epochs_outside": int(np.sum(~((mean >= finding.low) & (mean <= finding.high)))),
-        "consistent": not finding.rejected,
-    }
-
-
-def _nis(statistics: Statistics, sensor: int, finding: Finding) -> dict[str, Any]:
-    """Return the NIS per degree of freedom of a sensor."""
-    return {
-        "sensor": statistics.sensors[sensor],
-        "nis": statistics.sensor_nis[sensor],
-        "bounds": [finding.low, finding.high],
-        "degrees_of_freedom": int(statistics.sensor_degrees[sensor].sum()),
-        "refused": int(statistics.sensor_refused[sensor].sum()),
-        "consistent": not finding.rejected,
-    }
-
-
 def tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Return the tables of a :func:`summary`: consistency, errors at the end, and coverage; those of terminal, files and report."""
-    return [_tests(summary), _errors(summary), _coverage(summary)]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"
-
-
-def _tests(summary: Mapping[str, Any]) -> Table:
-    """Return NEES and NIS with their bounds."""
-    ranged = lambda value: "" if value is None else _number(value)  # noqa: E731
-    rows = [
-        ("NEES", subset, part["anees"], part["least"], part["greatest"], *part["bounds"], part["consistent"])
-        for subset, part in summary["nees"].items()
-    ]
-    rows += [
-        ("NIS", part["sensor"], part["nis"], None, None, *part["bounds"], part["consistent"]) for part in summary["nis"]
-    ]
-    columns = (
-        Column("", "statistic"),
-        Column("of", "of"),
-        Column("mean", "mean", shown=_number),
-        Column("minimum", "least", shown=ranged),
-        Column("maximum", "greatest", shown=ranged),
-        Column("from", "lower_bound", shown=_number),
-        Column("to", "upper_bound", shown=_number),
-        Column("", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
-    )
-    title = (
-        f"Per degree of freedom; 1 for a consistent filter. NEES over {summary['epochs_judged']} epochs; {summary['runs']} runs, bounds "
-        f"{100.0 * summary['confidence_level']:g} % together"
-    )
-    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in summary["nis"] if part["refused"])
-    notes = [f"The gate rejected {refused}."] if refused else []
-    return Table(title, columns, rows, notes, left=2, name="consistency")
+    """Return the errors at the end and the coverage of a :func:`summary` as tables; those of terminal, files and report."""
+    return [_errors(summary), _coverage(summary)]
 
 
 def _errors(summary: Mapping[str, Any]) -> Table:
@@ -170,7 +103,7 @@ def _errors(summary: Mapping[str, Any]) -> Table:
     rows = [
         (f"{what} {axis}", words, *(last[f"{what}_{key}_{unit}"][k] for key in sizes))
         for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
-        if what in summary["nees"]  # not all filters estimate a bias
+        if what in summary["coverage"]  # not all filters estimate a bias
         for k, axis in enumerate("xyz")
     ]
     title = f"Errors at {last['time_s']:g} s, {summary['runs']} runs; quantiles of the absolute error"
@@ -181,18 +114,18 @@ def _errors(summary: Mapping[str, Any]) -> Table:
 def _coverage(summary: Mapping[str, Any]) -> Table:
     """Return the fraction of errors within kσ, with the worst runs."""
     percent = lambda share: "-" if share is None else f"{100.0 * share:.2f} %"  # noqa: E731
-    rows = [
-        (what, *shares) for what, shares in summary["coverage"].items() if what == "expected" or what in summary["nees"]
-    ]
+    rows = [(what, *shares) for what, shares in summary["coverage"].items()]
     worst = ", ".join(
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in summary["worst_runs"][:5]
     )
     notes = [f"Worst runs, by maximum NEES of the state: {worst}."]
+    if refused := ", ".join(f"{number} of {sensor}" for sensor, number in summary["refused"].items() if number):
+        notes.append(f"The gate rejected {refused}.")
     if failed := summary["failed_runs"]:
         notes.append(f"In {failed} run{'s' if failed > 1 else ''} the filter failed: no finite error or covariance.")
     columns = (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3)))
-    title = f"Fraction of the errors within kσ at the tested epochs, {summary['runs']} runs"
+    title = f"Fraction of the errors within kσ at the {summary['epochs_judged']} tested epochs, {summary['runs']} runs"
     return Table(title, columns, rows, notes, name="coverage")
 
 

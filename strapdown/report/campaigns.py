@@ -29,16 +29,14 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     bound = verdicts.bound_of(held.plan)
     numbers = verdicts.summary(statistics, bound=bound)
     ending = "σ-coverage by state, and the covariance of the errors and of the filter"
-    many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
     parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
-    failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
     content = page.page(
         f"Monte Carlo: {name}",
         f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.version}",
         page.judged(judgement),
-        page.section("Key numbers", *parts, *failed),
         page.section("Evidence", page.table(judgement.listing())),
+        page.section("Key numbers", *parts),
         page.section("Over time", *_over_time(statistics, judgement)),
         page.section("At the end", page.figure(lambda: _end(statistics), ending)),
         _worst(statistics, path),
