@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,17 +11,6 @@ LINE_COLUMNS = 2000
 """Number of columns of equal time for a line: at least one per pixel of a wide figure."""
 BAND_COLUMNS = 250
 """Number of columns of equal time for a band: each usually contains a whole increase of σ between two measurements."""
-
-
-class Envelope(NamedTuple):
-    """Extremes of a series in columns of equal time."""
-
-    time: Array
-    """Time of the first sample of each column (k,)."""
-    low: Array
-    """Minimum of each column (k,); NaN if all its values are NaN."""
-    high: Array
-    """Maximum of each column (k,); NaN if all its values are NaN."""
 
 
 def column_starts(time: Array, columns: int) -> NDArray[np.int64]:
@@ -57,10 +44,17 @@ def decimated(time: Array, value: Array, columns: int = LINE_COLUMNS) -> tuple[A
     return time[rows], value[rows]
 
 
-def envelope(time: Array, low: Array, high: Array | None = None, columns: int = BAND_COLUMNS) -> Envelope:
-    """Return the minimum of ``low`` and the maximum of ``high`` (default: ``low``) in each column."""
+def envelope(
+    time: Array, low: Array, high: Array | None = None, columns: int = BAND_COLUMNS
+) -> tuple[Array, Array, Array]:
+    """Return the lines of a band to draw: time, minimum of ``low`` and maximum of ``high`` (default: ``low``), level over each column.
+
+    The extremes of a column are NaN if all its values are NaN; a series of no more samples than columns is returned as it is.
+    """
     high = low if high is None else high
     if len(time) <= columns:
-        return Envelope(time, low, high)
+        return time, low, high
     starts = column_starts(time, columns)
-    return Envelope(time[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts))
+    edges = np.append(time[starts], time[-1])
+    least, most = np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
+    return np.repeat(edges, 2)[1:-1], np.repeat(least, 2), np.repeat(most, 2)

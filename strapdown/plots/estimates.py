@@ -24,20 +24,6 @@ THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""
 
 
-def band(ax: Axes, time: Array, low: Array, high: Array, **look: Any) -> None:
-    """Fill between two series (n,); for long series between the extremes of each column."""
-    outline = envelope(time, low, high)
-    if len(time) <= BAND_COLUMNS:
-        ax.fill_between(*outline, linewidth=0, **look)
-        return
-    ends = (
-        np.append(outline.time, time[-1]),
-        np.append(outline.low, outline.low[-1]),
-        np.append(outline.high, outline.high[-1]),
-    )
-    ax.fill_between(*ends, step="post", linewidth=0, **look)
-
-
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
     """Draw errors (runs, n) over time (n,), s, with the filter's ±3σ (n,), in the unit of the axis, which the caller labels.
 
@@ -45,19 +31,13 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
     measurements, and lines that follow it would merge into a grey area that hides the errors.
     """
     ax = style.axes_or_new(ax)
-    bound = 3.0 * sigma
-    if len(time) <= BAND_COLUMNS:
-        band(ax, time, -bound, bound, color=style.SKY, alpha=0.35, label=f"{THREE_SIGMA} of the filter")
-    else:
-        outline = envelope(time, bound)
-        edges = np.append(outline.time, time[-1])
-        least, most = (np.append(values, values[-1]) for values in (outline.low, outline.high))
-        inner: dict[str, Any] = {"color": style.SKY, "alpha": 0.35, "linewidth": 0, "step": "post"}
-        outer = {**inner, "alpha": 0.18}
-        ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **inner)
-        if (most > 1.02 * least).any():
-            ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **outer)
-            ax.fill_between(edges, -most, -least, **outer)
+    edges, least, most = envelope(time, 3.0 * sigma)
+    dark: dict[str, Any] = {"color": style.SKY, "alpha": 0.35, "linewidth": 0}
+    light = {**dark, "alpha": 0.18}
+    ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **dark)
+    if (most > 1.02 * least).any():
+        ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **light)
+        ax.fill_between(edges, -most, -least, **light)
     ax.axhline(0.0, color=style.ink(), linewidth=0.6)
     for k, component in enumerate(error):
         ax.plot(
@@ -110,7 +90,8 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     unit, size = rate_unit(3.0 * sigma[settled, 3:])
     for k, name in enumerate(style.AXES):
         bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, 3 + k] / size
-        band(axes[3], estimate.time, bias - spread, bias + spread, color=style.CYCLE[k], alpha=0.18)
+        bounds = envelope(estimate.time, bias - spread, bias + spread)
+        axes[3].fill_between(*bounds, color=style.CYCLE[k], alpha=0.18, linewidth=0)
         axes[3].plot(
             *decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
         )
@@ -120,11 +101,11 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     total = np.linalg.norm(sigma[:, :3], axis=1)
     unit, size = angle_unit(total[settled])
     words = "root sum square of the three axes"
-    if len(total) <= BAND_COLUMNS:
-        axes[4].plot(estimate.time, total / size, color=style.ink(), linewidth=1.0)
-    else:  # a line that follows the changes of σ between measurements would be a black area
-        band(axes[4], estimate.time, total / size, total / size, color=style.SKY)
-        axes[4].plot(*envelope(estimate.time, total / size)[::2], color=style.ink(), linewidth=0.8)
+    # A line that follows the changes of σ between measurements would be a black area.
+    edges, least, most = envelope(estimate.time, total / size)
+    axes[4].fill_between(edges, least, most, color=style.SKY, linewidth=0)
+    axes[4].plot(edges, most, color=style.ink(), linewidth=0.8)
+    if len(total) > BAND_COLUMNS:
         words += ", minimum to maximum of each pixel"
     axes[4].set_ylabel(f"attitude σ, {unit}")
     axes[4].set_title(words, loc="right", fontsize="small")
@@ -154,13 +135,12 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
         for k, member in enumerate(members):
             color = style.CYCLE[k % len(style.CYCLE)]
-            low, high = values[:, k] - spread[:, k], values[:, k] + spread[:, k]
+            edges, low, high = envelope(estimate.time, values[:, k] - spread[:, k], values[:, k] + spread[:, k])
             if len(members) == 1:
-                band(ax, estimate.time, low, high, color=color, alpha=0.18)
+                ax.fill_between(edges, low, high, color=color, alpha=0.18, linewidth=0)
             else:  # filled bands of several components would hide each other
-                bounds = envelope(estimate.time, low, high)
-                for edge in (bounds.low, bounds.high):
-                    ax.plot(bounds.time, edge, ":", color=color, linewidth=0.9)
+                for edge in (low, high):
+                    ax.plot(edges, edge, ":", color=color, linewidth=0.9)
             ax.plot(*decimated(estimate.time, values[:, k]), color=color, linewidth=0.9, label=block.components[member])
         reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
         ax.set_ylim(-reach, reach)
