@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from strapdown.files import atomic_write, locked, reading, set_attributes, whole
 from strapdown.montecarlo import verdicts
 from strapdown.montecarlo.engine import MACHINES, Identity, Work, Workers, choose, chunks_of, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
-from strapdown.montecarlo.statistics import BINS, Statistics, merge
+from strapdown.montecarlo.statistics import ARRAYS, Statistics, lengths_of, merge
 from strapdown.records import CONVENTIONS, put
 from strapdown.results import Listed, Table
 
@@ -49,44 +49,6 @@ FORMAT = 1
 """Version of the layout; a newer one is refused."""
 SHARE = 0.1
 """Maximum fraction of the time spent writing the file; fast chunks are written several at a time."""
-
-
-class _Array(NamedTuple):
-    """An array of the statistics in the file."""
-
-    shape: tuple[int | str, ...]
-    """Lengths; those defined by the plan are named."""
-    meaning: str
-    unit: str = "1"
-    counts: bool = False
-    """Whether it holds integers."""
-
-
-_ERROR, _PRODUCT = "rad (columns 0-2), rad/s (columns 3-5)", "rad^2, rad^2/s, (rad/s)^2"
-_RUNS = "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents"
-_ARRAYS = {
-    "time": _Array(("epochs",), "epochs", "s"),
-    "finite": _Array(("epochs",), "runs whose error and covariance are finite numbers, by epoch", counts=True),
-    "error_sum": _Array(("epochs", 6), "sum over runs of the error (dtheta, db)", _ERROR),
-    "error_product_sum": _Array(("epochs", 6, 6), "sum over runs of error times its transpose", _PRODUCT),
-    "covariance_sum": _Array(("epochs", 6, 6), "sum over runs of the filter's covariance", _PRODUCT),
-    "nees_sum": _Array(
-        ("epochs", 3), "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"
-    ),
-    "log_nees_sum": _Array(("epochs", 3), "sum over runs of the natural logarithm of the same"),
-    "coverage": _Array(("epochs", 6, 3), "runs whose error lies inside 1, 2, 3 sigma, by epoch and state", counts=True),
-    "histogram": _Array(("epochs", 9, BINS), _RUNS, counts=True),
-    "nis_edges": _Array(("edges",), "edges of the spans of time of the NIS", "s"),
-    "sensor_nis_sum": _Array(("sensors", "spans"), "sum over runs of the NIS, by sensor and span of time"),
-    "sensor_degrees": _Array(("sensors", "spans"), "sum over runs of its degrees of freedom", counts=True),
-    "sensor_refused": _Array(("sensors", "spans"), "measurements that the gate refused", counts=True),
-    "worst_run": _Array(("worst",), "numbers of the worst runs", counts=True),
-    "worst_score": _Array(("worst",), "their largest NEES of the state"),
-    "example_run": _Array(("examples",), "numbers of the example runs", counts=True),
-    "example_error": _Array(("examples", "epochs", 6), "errors of the example runs by epoch", _ERROR),
-    "example_sigma": _Array(("examples", "epochs", 6), "the filter's standard deviations in the example runs", _ERROR),
-}
-"""Arrays of the statistics by name."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -432,31 +394,25 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
         "first_nees_exponent": NEES_EXPONENT,
     }
     set_attributes(group, attributes)
-    for name, dataset in _ARRAYS.items():
-        put(group, name, getattr(statistics, name), dataset.unit, dataset.meaning)
+    for name, layout in ARRAYS.items():
+        put(group, name, getattr(statistics, name), layout.unit, layout.meaning)
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
     """Return the statistics in a group; their shapes must be those of the plan."""
     attributes = reading.attributes(group)
-    arrays = {name: reading.numbers(group, name) for name in _ARRAYS}
+    arrays = {name: reading.numbers(group, name) for name in ARRAYS}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
-    lengths = {
-        "epochs": plan.epochs + 1,
-        "edges": plan.nis_bins + 1,
-        "spans": plan.nis_bins,
-        "sensors": len(plan.sensors),
-        "worst": len(arrays["worst_run"]),
-        "examples": len(arrays["example_run"]),
-    }
+    lengths = lengths_of(plan) | {"worst": len(arrays["worst_run"]), "examples": len(arrays["example_run"])}
     for name, value in arrays.items():
-        wanted = tuple(lengths[n] if isinstance(n, str) else n for n in _ARRAYS[name].shape)
-        sums = _ARRAYS[name].shape[0] == "epochs" and name != "time"  # sums over finite runs
+        layout = ARRAYS[name]
+        wanted = tuple(lengths.get(n, n) for n in layout.shape)
+        sums = layout.shape[0] == "epochs" and name != "time"  # sums over finite runs
         if value.shape != wanted or (sums and not np.isfinite(value).all()):
             raise InputError(
                 f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign again"
             )
-        if value.dtype.kind != ("i" if _ARRAYS[name].counts else "f"):
+        if value.dtype.kind != ("i" if layout.counts else "f"):
             raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign again")
     names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:

@@ -22,7 +22,6 @@ from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo.plan import Dispersions, Plan, initial_sigmas, unit
 from strapdown.montecarlo.statistics import (
-    BINS,
     ERROR_EXPONENT,
     EXAMPLES,
     NEES_EXPONENT,
@@ -30,6 +29,7 @@ from strapdown.montecarlo.statistics import (
     Statistics,
     bin_of,
     worst,
+    zeros,
 )
 from strapdown.motion import Motion
 from strapdown.records import Estimate, ImuRecord
@@ -122,25 +122,8 @@ class Sums:
     """Sums for the statistics of one plan, accumulated run by run."""
 
     def __init__(self, plan: Plan, runs: int) -> None:
-        m, s, k = plan.epochs + 1, len(plan.sensors), plan.nis_bins
         self.plan = plan
-        self.sums = SimpleNamespace(
-            time=plan.time,
-            runs=runs,
-            finite=np.zeros(m, np.int64),
-            error_sum=np.zeros((m, 6)),
-            error_product_sum=np.zeros((m, 6, 6)),
-            covariance_sum=np.zeros((m, 6, 6)),
-            nees_sum=np.zeros((m, 3)),
-            log_nees_sum=np.zeros((m, 3)),
-            coverage=np.zeros((m, 6, 3), np.int64),
-            histogram=np.zeros((m, 9, BINS), np.int64),
-            nis_edges=plan.nis_edges,
-            sensors=plan.sensors,
-            sensor_nis_sum=np.zeros((s, k)),
-            sensor_degrees=np.zeros((s, k), np.int64),
-            sensor_refused=np.zeros((s, k), np.int64),
-        )
+        self.sums = SimpleNamespace(runs=runs, **zeros(plan))
         self.scores: list[tuple[int, float]] = []
         self.examples: list[tuple[int, Array, Array]] = []
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -392,6 +392,61 @@ class Statistics(ByValue, Listed):
         """
         quantile = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
         return np.asarray(np.where(self._runs_of_state > 0.0, quantile, np.nan))
+
+
+class Layout(NamedTuple):
+    """Shape and type of an array of the statistics, with its description in files."""
+
+    shape: tuple[Any, ...]
+    """Lengths; those of :func:`lengths_of`, and of the worst and the example runs, by name."""
+    meaning: str
+    unit: str = "1"
+    counts: bool = False
+    """Whether it holds integers."""
+
+
+_ERROR, _PRODUCT = "rad (columns 0-2), rad/s (columns 3-5)", "rad^2, rad^2/s, (rad/s)^2"
+_RUNS = "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents"
+ARRAYS = {
+    "time": Layout(("epochs",), "epochs", "s"),
+    "finite": Layout(("epochs",), "runs whose error and covariance are finite numbers, by epoch", counts=True),
+    "error_sum": Layout(("epochs", 6), "sum over runs of the error (dtheta, db)", _ERROR),
+    "error_product_sum": Layout(("epochs", 6, 6), "sum over runs of error times its transpose", _PRODUCT),
+    "covariance_sum": Layout(("epochs", 6, 6), "sum over runs of the filter's covariance", _PRODUCT),
+    "nees_sum": Layout(
+        ("epochs", 3), "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"
+    ),
+    "log_nees_sum": Layout(("epochs", 3), "sum over runs of the natural logarithm of the same"),
+    "coverage": Layout(("epochs", 6, 3), "runs whose error lies inside 1, 2, 3 sigma, by epoch and state", counts=True),
+    "histogram": Layout(("epochs", 9, BINS), _RUNS, counts=True),
+    "nis_edges": Layout(("edges",), "edges of the spans of time of the NIS", "s"),
+    "sensor_nis_sum": Layout(("sensors", "spans"), "sum over runs of the NIS, by sensor and span of time"),
+    "sensor_degrees": Layout(("sensors", "spans"), "sum over runs of its degrees of freedom", counts=True),
+    "sensor_refused": Layout(("sensors", "spans"), "measurements that the gate refused", counts=True),
+    "worst_run": Layout(("worst",), "numbers of the worst runs", counts=True),
+    "worst_score": Layout(("worst",), "their largest NEES of the state"),
+    "example_run": Layout(("examples",), "numbers of the example runs", counts=True),
+    "example_error": Layout(("examples", "epochs", 6), "errors of the example runs by epoch", _ERROR),
+    "example_sigma": Layout(("examples", "epochs", 6), "the filter's standard deviations in the example runs", _ERROR),
+}
+"""Arrays of the statistics by name."""
+
+
+def lengths_of(plan: Plan) -> dict[str, int]:
+    """Return the lengths that a plan defines, by their names in :data:`ARRAYS`."""
+    bins = plan.nis_bins
+    return {"epochs": plan.epochs + 1, "edges": bins + 1, "spans": bins, "sensors": len(plan.sensors)}
+
+
+def zeros(plan: Plan) -> dict[str, Any]:
+    """Return the arrays of :class:`Statistics` whose shape a plan defines: times, and sums that are zero."""
+    lengths = lengths_of(plan)
+    sums = {
+        name: np.zeros([lengths.get(n, n) for n in layout.shape], np.int64 if layout.counts else np.float64)
+        for name, layout in ARRAYS.items()
+        if not {"worst", "examples"} & set(layout.shape)
+    }
+    return {**sums, "time": plan.time, "nis_edges": plan.nis_edges, "sensors": plan.sensors}
 
 
 def _anees(statistics: Statistics, epochs: Counts, subset: str, probability: float, failed: int) -> Finding:

@@ -176,27 +176,17 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
     plan = montecarlo.Plan(
         scenario=scenario, setup=setup.FilterSetup.for_scenario(scenario, states=False), epochs=2, nis_bins=2
     )
-    m, s, runs = 3, len(plan.sensors), 4
-    zeros: dict[str, Any] = {
-        "error_sum": (m, 6), "error_product_sum": (m, 6, 6), "covariance_sum": (m, 6, 6), "nees_sum": (m, 3), "log_nees_sum": (m, 3),
-        "sensor_nis_sum": (s, 2), "worst_score": (runs,), "example_error": (runs, m, 6), "example_sigma": (runs, m, 6),
-    }  # fmt: skip
-    counts: dict[str, Any] = {
-        "coverage": (m, 6, 3),
-        "histogram": (m, 9, sums.BINS),
-        "sensor_degrees": (s, 2),
-        "sensor_refused": (s, 2),
-    }
+    runs, arrays = 4, sums.zeros(plan)
+    arrays["finite"] += runs
+    examples = np.zeros((2, runs, 3, 6))
     statistics = sums.Statistics(
-        time=plan.time,
-        nis_edges=plan.nis_edges,
-        sensors=plan.sensors,
         runs=runs,
-        finite=np.full(m, runs),
         worst_run=np.arange(runs),
+        worst_score=np.zeros(runs),
         example_run=np.arange(runs),
-        **{name: np.zeros(shape) for name, shape in zeros.items()},
-        **{name: np.zeros(shape, np.int64) for name, shape in counts.items()},
+        example_error=examples[0],
+        example_sigma=examples[1],
+        **arrays,
     )
     held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=statistics)
     campaign._write(path, held, plan.to_table())
