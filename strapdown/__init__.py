@@ -61,6 +61,7 @@ if TYPE_CHECKING:
         vectors,
     )
     from strapdown.ahrs import LiveAhrs
+    from strapdown.allan import allan_deviation, fit_noise
     from strapdown.calibration import calibrate
     from strapdown.checks import InputError
     from strapdown.codegen import export
@@ -71,12 +72,10 @@ if TYPE_CHECKING:
     from strapdown.vectors import VectorSensor
     from strapdown.workflows import (
         accuracy,
-        allan_deviation,
         check,
         covariance_analysis,
         diagnose,
         estimate,
-        fit_noise,
         integrate,
         monte_carlo,
         read,
@@ -144,6 +143,7 @@ _HOMES = {
     name: home
     for home, names in {
         "ahrs": "LiveAhrs",
+        "allan": "allan_deviation fit_noise",
         "calibration": "calibrate",
         "checks": "InputError",
         "codegen": "export",
@@ -152,8 +152,8 @@ _HOMES = {
         "gyro": "GyroSpec",
         "scenarios": "Scenario",
         "vectors": "VectorSensor",
-        "workflows": "accuracy allan_deviation check covariance_analysis diagnose estimate fit_noise integrate monte_carlo read "
-        "read_attitudes simulate smooth tune write",
+        "workflows": "accuracy check covariance_analysis diagnose estimate integrate monte_carlo read read_attitudes simulate smooth tune "
+        "write",
     }.items()
     for name in names.split()
 }

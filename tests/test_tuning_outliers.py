@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from scipy.stats import chi2, norm
 from two_stars import ANGLES, BELIEVED, FREE, KINDS, TRUTH, WRONG, differences
 
+import strapdown as sd
 from strapdown import scenarios, tuning, vectors
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
@@ -289,7 +290,7 @@ def test_outliers_are_found_beside_correlated_noise_that_has_states():
     truth = {"star 1.sigma": 1e-4, "star 2.sigma": 2e-4}
     wrong = tuning.with_values(filter_setup, {name: 2.0 * value for name, value in truth.items()})
     case = tuning.record_case(scenarios.simulate(scenario, 4), filter_setup, seed=4)
-    tuned = tuning.tune([case], wrong, tuple(truth), starts=1, gate=True)
+    tuned = sd.tune(case, setup=wrong, free=tuple(truth), starts=1, threads=1, gate=True)
     gate = tuned.gate
     for parameter, right in zip(tuned.parameters, [*truth.values(), 0.05, 10.0], strict=True):
         assert parameter.lower <= right <= parameter.upper, parameter

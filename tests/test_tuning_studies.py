@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from two_stars import BELIEVED, FREE, scenario
 
+import strapdown as sd
 from strapdown import coning, covariance, gyro, montecarlo, scenarios, tuning, vectors
 from strapdown.ahrs import AhrsParameters
 from strapdown.consistency import reference_errors
@@ -208,7 +209,7 @@ def test_innovations_of_a_recording_tune_the_scale_alone_and_leave_no_sigma_too_
     filter_setup = AhrsParameters().setup
     names, spacing = tuning.by_innovations(None)
     trials = recorded(broad, slice(trial, trial + 1))
-    tuned = tuning.tune(trials, filter_setup, names, spacing=spacing, starts=1).setup
+    tuned = sd.tune(trials, setup=filter_setup, free=names, spacing=spacing, starts=1, threads=1).setup
     after = tuning.compare(trials, filter_setup, tuned).after
     assert 0.02 < np.nanmean(after.courses[1].mean) < 1.0
     np.testing.assert_allclose(rmse(trials[0], tuned), rmse(trials[0], filter_setup), rtol=1e-5)

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from strapdown import checks
+from strapdown import checks, recordings
 from strapdown.allan.power_laws import (
     MANY_BLOCKS,
     NOISE_TYPES,
@@ -36,7 +36,11 @@ from strapdown.allan.spectrum import flicker_covariance, inner
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
+from strapdown.records import ImuRecord, Recording
 from strapdown.results import Column, Listed, Table
+
+Source = Recording | ImuRecord | recordings.GyroSamples | ArrayLike
+"""Samples of a sensor at rest."""
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
@@ -101,23 +105,26 @@ class AllanDeviation(Listed):
 
 
 def allan_deviation(
-    values: ArrayLike,
-    sample_interval: float,
+    source: Source,
+    sample_interval: float | None = None,
     *,
+    sensor: str = "gyro",
     kind: str = "rate",
     taus: ArrayLike | None = None,
     level: float = 0.95,
 ) -> AllanDeviation:
-    """Return the Allan deviation of a record with its confidence band.
+    """Return the Allan deviation of a sensor at rest, with its confidence band.
 
     Parameters
     ----------
-    values : array_like (n,) or (n, axes)
-        Averaged-rate samples, rad/s, or angle increments, rad; at most three axes.
-    sample_interval : float
-        Sample interval, s.
+    source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
+        Samples at rest; in an array averages over each sample interval or integrals, at most three axes. Missing samples are NaN.
+    sample_interval : float, optional
+        For an array: time between its samples, s.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        For a recording: the sensor.
     kind : {"rate", "increments"}, default "rate"
-        Kind of the values.
+        For an array: averages over each sample interval, rad/s, or integrals, rad.
     taus : array_like, optional
         Averaging times, s, each rounded to a multiple of the sample interval; duplicates are dropped. Default: 12 per decade, up to a
         third of the record, with gaps to a tenth.
@@ -127,7 +134,7 @@ def allan_deviation(
     Returns
     -------
     AllanDeviation
-        The deviation of each axis.
+        Deviation at each averaging time and axis, in the unit of the samples (increments: that unit per s), and its confidence band.
 
     Notes
     -----
@@ -142,8 +149,17 @@ def allan_deviation(
     The phase is the sum of the rate less its mean, in float64 with compensated summation, so that each value is rounded once (½ unit in the
     last place of the largest phase), also after 1e8 samples. Memory: one float64 per sample in addition to the record, one axis at a time.
     Time: proportional to the number of samples for each τ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import strapdown as sd
+    >>> white = np.random.default_rng(1).standard_normal(100_000)
+    >>> result = sd.allan_deviation(white, 0.01, taus=[1.0])
+    >>> round(float(result.deviation[0, 0]), 2)  # σ √(dt/τ)
+    0.1
     """
-    record, dt, scale = averaged(values, sample_interval, kind)
+    record, dt, scale = averaged(source, sample_interval, sensor, kind)
     level = confidence(level)
     known = ~np.isnan(record).any(axis=1)
     samples = int(known.sum())
@@ -272,11 +288,19 @@ def confidence(level: float) -> float:
     return number
 
 
-def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array, float, float]:
-    """Return the record (n, axes), NaN for missing samples, its sample interval, and the factor that converts its values to rates."""
+def averaged(source: Source, sample_interval: float | None, sensor: str, kind: str) -> tuple[Array, float, float]:
+    """Return the samples (n, axes), NaN for missing ones, their interval, and the factor that converts their values to rates."""
+    if isinstance(source, (Recording, ImuRecord)):
+        source = recordings.samples_of(source, sensor, gaps=True)
+    if isinstance(source, recordings.GyroSamples):
+        if sample_interval is not None:
+            raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
+        sample_interval, kind, source = source.sample_interval, source.kind, source.values
+    if sample_interval is None:
+        raise InputError("sample_interval is missing; for an array, give the time between its samples in s")
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     checks.one_of("kind", kind, ("rate", "increments"))
-    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"), allow_nan=True)
+    record = checks.array("values", source, ("n",) if np.ndim(source) == 1 else ("n", "axes"), allow_nan=True)
     if record.ndim == 1:
         record = record[:, None]
     if not 1 <= record.shape[1] <= 3:

@@ -22,10 +22,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from strapdown import checks, units
-from strapdown.allan.deviation import TERMS, AllanDeviation, averaged, confidence, model_deviation
+from strapdown.allan.deviation import TERMS, AllanDeviation, Source, averaged, confidence, model_deviation
 from strapdown.allan.spectrum import (
     Bins,
     Segment,
@@ -206,28 +206,30 @@ class NoiseFit(Listed):
 
 
 def fit_noise(
-    values: ArrayLike,
-    sample_interval: float,
+    source: Source,
+    sample_interval: float | None = None,
     *,
-    kind: str = "rate",
     sensor: str = "gyro",
+    kind: str = "rate",
     terms: Sequence[str] = TERMS,
     highest_frequency: float | None = None,
     level: float = 0.95,
 ) -> NoiseFit:
-    """Return the noise coefficients of a record at rest, each with its interval, or with an upper bound if it is not supported.
+    """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with confidence intervals.
+
+    A term that the record does not support has an upper bound.
 
     Parameters
     ----------
-    values : array_like (n,) or (n, axes)
-        Averaged-rate samples, rad/s, or angle increments, rad, at most three axes. Gaps are NaN and must not depend on the lost values;
-        segments of at least 64 samples between them are used, whose number of samples is ``samples`` of the result.
-    sample_interval : float
-        Sample interval, s.
-    kind : {"rate", "increments"}, default "rate"
-        Kind of the values.
+    source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
+        Samples at rest, at most three axes. Gaps, NaN in an array, must not depend on the lost values; segments of at least 64 samples
+        between them are used, whose number of samples is ``samples`` of the result.
+    sample_interval : float, optional
+        For an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor of the values, which are in m/s² or T if it is not a gyro.
+        Sensor; the values of an array are in m/s² or T if it is not a gyro.
+    kind : {"rate", "increments"}, default "rate"
+        For an array: averages over each sample interval, or integrals.
     terms : sequence of str, default TERMS
         Terms to fit, of :data:`TERMS`.
     highest_frequency : float, optional
@@ -239,7 +241,7 @@ def fit_noise(
     Returns
     -------
     NoiseFit
-        Coefficients, SI, of each axis.
+        Coefficients, SI, and intervals of each axis; can be passed to :func:`strapdown.estimate` as ``noise``.
 
     Notes
     -----
@@ -262,8 +264,14 @@ def fit_noise(
     References: Self & Liang, "Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
     nonstandard conditions", J. Am. Stat. Assoc. 82, 1987; Fletcher & Turek, "Model-averaged profile likelihood intervals", J.
     Agric. Biol. Environ. Stat. 17, 2012.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> noise = sd.fit_noise(sd.read("rest.csv", units={"gyro": "deg/s"}))  # doctest: +SKIP
+    >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
-    record, dt, scale = averaged(values, sample_interval, kind)
+    record, dt, scale = averaged(source, sample_interval, sensor, kind)
     level = confidence(level)
     checks.one_of("sensor", sensor, SENSORS)
     names = [checks.one_of("terms: term", term, TERMS) for term in terms]

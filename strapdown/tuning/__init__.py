@@ -1,6 +1,7 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
-- ``procedure``: :func:`tune`: objective, search, residual checks and validation in one call.
+:func:`strapdown.tune` does all steps in one call.
+
 - ``objective``: Base of the objectives: checks of the problem, setups at a point, sums over records and threads.
 - ``innovations``: Likelihood of the innovations, with score and information; eight parameter sets per pass if the filter allows.
 - ``errors``: Likelihood of the errors against a truth.
@@ -25,12 +26,11 @@ tune only ``filter.scale``, which scales the σ and leaves the estimates unchang
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Slices, Tuning, fit, search, slices
 from strapdown.tuning.initialization import by_innovations, one_gyro, record_case, recording_case
-from strapdown.tuning.innovations import likelihood
+from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import Case
-from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
+from strapdown.tuning.outliers import GATED, TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names, priors_from_gyro, unit_of, values_of, with_values
-from strapdown.tuning.procedure import GATED, tune
-from strapdown.tuning.residual_checks import Unmodelled, unmodelled, with_misfit_flag
+from strapdown.tuning.residual_checks import Unmodelled, examined, unmodelled, with_misfit_flag
 from strapdown.tuning.validation import Comparison, compare, split
 
 __all__ = [
@@ -44,5 +44,4 @@ __all__ = [
     "record_case",
     "recording_case",
     "split",
-    "tune",
 ]

@@ -31,6 +31,8 @@ from strapdown.tuning.objective import OUTLIERS, SCALES, SHARES, Case
 from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
 from strapdown.vectors import KINDS
 
+GATED = ("gate.probability", *OUTLIERS)
+"""Names of parameters that need a model of outliers."""
 SHARE, SCALE = 0.02, 5.0
 """Initial share and scale of the search."""
 MAX_REFUSED = 0.25

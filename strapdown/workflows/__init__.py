@@ -2,7 +2,7 @@
 
 Each function chooses gyro noise, filter and initial state from the data and then calls a module that has more options:
 :mod:`strapdown.estimation` and :mod:`strapdown.estimation.setup`, :mod:`strapdown.ahrs`, :mod:`strapdown.consistency`,
-:mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
+:mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`.
 """
 
 from strapdown.covariance import analyse as covariance_analysis
@@ -13,19 +13,16 @@ from strapdown.workflows.estimating import Run, estimate, smooth
 from strapdown.workflows.files import read, write
 from strapdown.workflows.integrating import AttitudeHistory, integrate
 from strapdown.workflows.judging import accuracy, check, diagnose
-from strapdown.workflows.noise import allan_deviation, fit_noise
 from strapdown.workflows.tuning import tune
 
 __all__ = [
     "AttitudeHistory",
     "Run",
     "accuracy",
-    "allan_deviation",
     "check",
     "covariance_analysis",
     "diagnose",
     "estimate",
-    "fit_noise",
     "integrate",
     "monte_carlo",
     "plan",

@@ -68,8 +68,8 @@ def estimate(
     source : ImuRecord or Recording
         Result of :func:`simulate` or :func:`read`, or a record made from your own data.
     noise : GyroSpec, NoiseFit or ProcessNoise, optional
-        Noise of the gyro: a specification, an Allan fit (:func:`fit_noise`), or the two coefficients of the filter. Default: that of the
-        record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
+        Noise of the gyro: a specification, an Allan fit (:func:`strapdown.fit_noise`), or the two coefficients of the filter. Default:
+        that of the record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
     setup : FilterSetup, optional
         For a record: the complete filter, for example from :func:`tune`, in place of ``noise`` and ``states``.
     initial : State, array_like (4,) or "truth", optional

@@ -18,11 +18,14 @@ from strapdown.workflows.estimating import SOURCE
 from strapdown.workflows.filters import matched_filter, need_angles
 
 if TYPE_CHECKING:
-    from strapdown.tuning import Prior, Tuning
+    from strapdown.tuning import Case, Prior, Tuning
+    from strapdown.tuning.objective import Objective
+
+    Source = ImuRecord | Recording | Case
 
 
 def tune(
-    sources: ImuRecord | Recording | Sequence[ImuRecord | Recording] | Mapping[str, ImuRecord | Recording],
+    sources: Source | Sequence[Source] | Mapping[str, Source],
     *,
     setup: FilterSetup | None = None,
     free: Sequence[str] | None = None,
@@ -41,19 +44,20 @@ def tune(
 
     Parameters
     ----------
-    sources : ImuRecord, Recording, sequence or mapping of them
-        Records of one unit; in a mapping with their names in messages.
+    sources : ImuRecord, Recording, Case, sequence or mapping of them
+        Records of one unit; in a mapping with their names in messages. A Case (:mod:`strapdown.tuning`) has its own initial state.
     setup : FilterSetup, optional
         Initial filter. Default: matched to the first record, or that of recordings.
     free : sequence of str, optional
         Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …. Default: the two of the gyro and the σ of every sensor;
-        for recordings without ``truth`` only ``"filter.scale"``.
+        for recordings without ``truth`` only ``"filter.scale"``. Those of outliers imply ``gate``.
     states : bool, optional
         Whether the matched filter has an error state for each error that the record specifies. Default: if there are such errors.
     priors : mapping of str to Prior, or GyroSpec, optional
         Prior distributions of parameters, by name; or a gyro, for weak priors of its noise.
     truth : bool, default False
-        Whether to tune by the likelihood of the errors relative to the truth, in place of that of the innovations.
+        Whether to tune by the likelihood of the errors relative to the truth, of the filter with its gate. Default: by that of the
+        innovations of the filter without its gate, because the likelihood of accepted ones increases as the gate becomes narrower.
     gate : bool, default False
         Whether to model the fraction and scale of outliers too, for the filter's gate.
     spacing : float, default 0.0
@@ -83,64 +87,123 @@ def tune(
     from strapdown import tuning
 
     count("seed", seed, minimum=0)
-    if not isinstance(sources, Mapping):
-        listed = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
-        sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
-    if not sources:
-        raise InputError("sources is empty; give at least one record or recording")
-    for source in sources.values():
-        instance("sources", source, (ImuRecord, Recording), SOURCE)
-        if isinstance(source, Recording):
-            ahrs.need_accelerometer(source)
-            ahrs.check_conventions.warn(source)
-    own, remarks, cases = setup is not None, list[str](), []
-    for label, source in sources.items():
-        if isinstance(source, ImuRecord):
-            if setup is None:
-                if source.origin is None or source.origin.gyro is None:
-                    raise InputError(
-                        f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
-                    )
-                setup, remarks = matched_filter(source, states=states)
-            elif own and states:
-                if setup.states is not None:
-                    raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
-                added = setups.FilterSetup.for_record(source, states=True).states
-                setup, states = dataclasses.replace(setup, states=added), None
-            need_angles(setup, source)
-            cases.append(tuning.record_case(source, setup, name=label))
-        else:
-            setup = setup or ahrs.AhrsParameters().setup
-            cases.append(tuning.recording_case(source))
-    assert setup is not None
+    threads = count("threads", threads if threads is not None else os.cpu_count() or 1)
+    own, by_name = setup is not None, _by_name(sources)
+    setup, cases, remarks = _cases(by_name, setup, states)
+    gate = gate or any(name in tuning.GATED for name in free or ())
     if own and (setup.gate or setup.robust) and not (truth or gate):
         remarks.append(
             "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. "
             f"{Hint('gate', True)} models outliers, and {Hint('truth', True)} tunes the filter with its gate and weights."
         )
-    if not (truth or all(isinstance(source, ImuRecord) for source in sources.values())):
+    if not truth and any(isinstance(source, Recording) for source in by_name.values()):
         free, spacing = tuning.by_innovations(free, spacing, gate=gate, priors=priors)
-    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout)
-    wanted = [name for name in free or () if name not in tuning.GATED]
-    wanted = wanted or list(tuning.default_names([case.record for case in cases]))
-    if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
-        origins = {label: source.origin for label, source in sources.items() if isinstance(source, ImuRecord)}
+    names = [name for name in free or () if name not in tuning.GATED]
+    names = names or list(tuning.default_names([case.record for case in cases]))
+    if not own or any(name.startswith(("gyro.", "filter.")) for name in names):
+        origins = {label: case.record.origin for label, case in zip(by_name, cases, strict=True)}
         tuning.one_gyro({label: origin.gyro for label, origin in origins.items() if origin and origin.gyro})
+    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout)
     if isinstance(priors, GyroSpec):
         by_gyro = tuning.priors_from_gyro(priors, train[0].record)
-        priors = {name: prior for name, prior in by_gyro.items() if name in wanted}
-    result = tuning.tune(
-        train,
-        setup,
-        [*wanted, *(name for name in free or () if name in tuning.GATED)],
-        held=held,
-        priors=priors,
-        truth=truth,
-        gate=gate,
-        spacing=spacing,
-        starts=starts,
-        seed=seed,
-        threads=count("threads", threads if threads is not None else os.cpu_count() or 1),
-        progress=progress,
-    )
-    return dataclasses.replace(result, remarks=tuple(remarks))
+        priors = {name: prior for name, prior in by_gyro.items() if name in names}
+    objective = _objective(train, setup, names, truth=truth, gate=gate, spacing=spacing, threads=threads)
+    at_once = 1 if truth and len(train) > 1 else threads  # searches, unless records are evaluated in parallel
+    result = tuning.fit(objective, priors=priors, starts=starts, seed=seed, threads=at_once, progress=progress)
+    result = _completed(result, objective, setup, held, threads)
+    unmodelled = tuning.examined(train, setup, result)
+    if unmodelled:
+        result = tuning.with_misfit_flag(result, max(unmodelled, key=lambda check: check.severity))
+    return dataclasses.replace(result, unmodelled=unmodelled, remarks=tuple(remarks))
+
+
+def _by_name(sources: Source | Sequence[Source] | Mapping[str, Source]) -> Mapping[str, Source]:
+    """Return the sources by their names in messages, checked."""
+    from strapdown.tuning import Case
+
+    if not isinstance(sources, Mapping):
+        listed = [sources] if isinstance(sources, (ImuRecord, Recording, Case, str, os.PathLike)) else list(sources)
+        sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
+    if not sources:
+        raise InputError("sources is empty; give at least one record or recording")
+    for source in sources.values():
+        instance("sources", source, (ImuRecord, Recording, Case), SOURCE)
+        if isinstance(source, Recording):
+            ahrs.need_accelerometer(source)
+            ahrs.check_conventions.warn(source)
+    return sources
+
+
+def _cases(
+    sources: Mapping[str, Source], setup: FilterSetup | None, states: bool | None
+) -> tuple[FilterSetup, list[Case], list[str]]:
+    """Return the initial filter, the records with the filter's initial states, and remarks on the filter."""
+    from strapdown import tuning
+
+    own, remarks, cases = setup is not None, list[str](), []
+    for label, source in sources.items():
+        if isinstance(source, Recording):
+            setup = setup or ahrs.AhrsParameters().setup
+            cases.append(tuning.recording_case(source))
+            continue
+        record = source if isinstance(source, ImuRecord) else source.record
+        if setup is None:
+            if record.origin is None or record.origin.gyro is None:
+                raise InputError(
+                    f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
+                )
+            setup, remarks = matched_filter(record, states=states)
+        elif own and states:
+            if setup.states is not None:
+                raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
+            added = setups.FilterSetup.for_record(record, states=True).states
+            setup, states = dataclasses.replace(setup, states=added), None
+        need_angles(setup, record)
+        cases.append(tuning.record_case(source, setup, name=label) if isinstance(source, ImuRecord) else source)
+    assert setup is not None
+    return setup, cases, remarks
+
+
+def _objective(
+    cases: Sequence[Case],
+    setup: FilterSetup,
+    names: Sequence[str],
+    *,
+    truth: bool,
+    gate: bool,
+    spacing: float,
+    threads: int,
+) -> Objective:
+    """Return the objective that the options select."""
+    from strapdown import tuning
+
+    if spacing > 0.0 and truth:
+        raise InputError(
+            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
+        )
+    if gate and (truth or spacing > 0.0):
+        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
+    if truth:
+        return tuning.error_objective(cases, setup, names, threads=threads)
+    if gate:
+        return tuning.contaminated_likelihood(cases, setup, names)
+    return tuning.likelihood(cases, setup, names, spacing=spacing)
+
+
+def _completed(result: Tuning, objective: Objective, before: FilterSetup, held: Sequence[Case], threads: int) -> Tuning:
+    """Return the result of a search with the gate, if outliers are modelled, and the comparison on held-out data, if there are any."""
+    from strapdown import tuning
+
+    mixed = objective if isinstance(objective, tuning.Likelihood) and objective.mixed else None
+    if mixed is not None:
+        gated = tuning.tuned_gate(mixed, result)
+        tuned = result.setup if gated.gate is None else dataclasses.replace(result.setup, gate=gated.gate)
+        result = dataclasses.replace(result, gate=gated, setup=tuned)
+    if held:
+        comparison = tuning.compare(held, before, result.setup, threads=threads)
+        if mixed is not None:  # the likelihood after tuning includes the gate
+            likely = tuning.log_likelihood(held, mixed, result)
+            after = dataclasses.replace(comparison.after, log_likelihood=likely)
+            comparison = dataclasses.replace(comparison, after=after)
+        result = dataclasses.replace(result, comparison=comparison)
+    return result
