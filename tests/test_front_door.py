@@ -231,7 +231,20 @@ def test_integrate_starts_at_the_truth(tmp_path):
     assert history.remarks[-1].startswith(f"Error relative to the true attitude: final {np.degrees(error[-1]):.4g}°")
     assert error.max() < 1e-3  # at constant rate one sample is exact: what is left is noise and bias
     assert sd.integrate(record, initial_attitude=[1.0, 0.0, 0.0, 0.0]).attitude[0] == pytest.approx([1, 0, 0, 0])
-    assert sd.read(sd.write(history, tmp_path / "attitude.h5")) == history
+    path = sd.write(history, tmp_path / "attitude.h5")
+    assert sd.read(path) == history
+    assert sd.read_attitudes(path).covariance is None
+    assert sd.accuracy(history, record).given["all samples"]["total"].maximum == pytest.approx(error.max())
+
+
+def test_an_integrated_attitude_has_no_bias_and_no_sigma():
+    history = sd.integrate(sd.simulate(scenario(10.0)))
+    assert not history.has_bias
+    assert not history.has_covariance
+    assert history.euler().sigma is None
+    assert list(history.table())[5:] == ["yaw_deg", "pitch_deg", "roll_deg", "heading_deg"]
+    assert sd.check(history).reason == "no covariance: nothing to test"
+    assert len(sd.plots.estimate_overview(history).axes) == 3
 
 
 def test_files_are_recognised_by_their_content(tmp_path):

@@ -286,7 +286,8 @@ def test_files_that_are_no_campaign_are_refused(of_21_runs, tmp_path):
         path.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(InputError, match="truncated"):
             campaign.read(path)
-    records.write_attitude(path, np.arange(2.0), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+    with records.result_file(path, "estimate", None):
+        pass
     with pytest.raises(InputError, match="no Monte Carlo campaign"):
         campaign.read(path)
 

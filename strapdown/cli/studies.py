@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,12 +102,12 @@ def integrate(
     out: Path = Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
-    ui.check_files(out, suffixes=ui.HDF5, own="strapdown attitude")
+    ui.check_files(out, suffixes=ui.HDF5, own="strapdown estimate")
     rule = sd.coning.named(algorithm)
     with ui.progress_bar("reading, integrating, writing"):
         source: Any = sd.read(recording, gyro_alone=True, **layout.options)
         with reading.from_file(recording):
-            history = replace(sd.integrate(source, rule), source=recording.name)
+            history = sd.integrate(source, rule)
         sd.write(history, out)
     ui.say(f"{recording.name}: {history.remarks[0]}", *history.remarks[1:])
     ui.written(out)

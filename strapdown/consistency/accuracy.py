@@ -233,9 +233,9 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     if not known.any():
         raise InputError("the truth has no attitude at the estimate's times")
     P = estimate.attitude_covariance
-    own = Series(estimate.time, estimate.attitude, P if np.isfinite(P).all() else None)
+    own = Series(estimate.time, estimate.attitude, P if P is not None and np.isfinite(P).all() else None)
     theirs = truth.taken(known)
-    as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else P[known])
+    as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else own.covariance[known])
     alignment: Alignment | None = None
     aligned: dict[str, dict[str, ErrorSize]] = {}
     if align:

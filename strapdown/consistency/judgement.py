@@ -316,12 +316,12 @@ def judge(
         if innovations.refused:
             limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
     findings += _of_pairs(estimate)
-    without = not np.isfinite(estimate.variance[:, :3]).any()
-    untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], NO_COVARIANCE if without else NO_TRUTH)
+    why = NO_TRUTH if estimate.has_covariance else NO_COVARIANCE
+    untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], why)
     truth = estimate.truth if truth is None else truth
     if truth is None:
         limits.append(WITHOUT_TRUTH)
-    elif not without:
+    elif estimate.has_covariance:
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         names = tuple(estimate.error_states)

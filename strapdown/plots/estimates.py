@@ -75,8 +75,11 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
-    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias with its ±3σ, and the attitude's σ over time."""
-    figure, axes = style.new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
+    """Draw roll, pitch and yaw (sequence Z-Y-X), and if they are known the gyro bias with its ±3σ and the attitude's σ over time."""
+    heights = [1.0, 1.0, 1.0, *[1.7] * estimate.has_bias, *[1.3] * estimate.has_covariance]
+    figure, axes = style.new_figure(
+        len(heights), 1, size=(9.0, 10.0 * sum(heights) / 6.0), sharex=True, height_ratios=heights
+    )
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
     for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
         ax.plot(*unbroken(estimate.time, angle), color=style.BLUE, linewidth=0.9)
@@ -84,40 +87,53 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
         if np.ptp(angle) > 180.0:
             ax.yaxis.set_major_locator(MultipleLocator(90.0))
         ax.set_title(f"Euler angles Z-Y-X: {name}", loc="right", fontsize="small")
-    sigma = estimate.sigma
+    if estimate.has_bias:
+        _bias(axes[3], estimate)
+    if estimate.has_covariance:
+        _attitude_sigma(axes[-1], estimate)
+    axes[-1].set_xlabel("time, s")
+    axes[-1].set_xlim(estimate.time[0], estimate.time[-1])
+    axes[0].set_title(title, loc="left")
+    return figure
+
+
+def _bias(ax: Axes, estimate: Estimate) -> None:
+    """Draw the gyro bias with its ±3σ over time."""
+    sigma = estimate.sigma[:, 3:]
     settled = slice(len(estimate.time) // 20, None)
-    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
-    unit, size = rate_unit(3.0 * sigma[settled, 3:])
+    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled].max()
+    unit, size = rate_unit(3.0 * sigma[settled])
     for k, name in enumerate(style.AXES):
-        bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, 3 + k] / size
+        bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, k] / size
         bounds = envelope(estimate.time, bias - spread, bias + spread)
-        axes[3].fill_between(*bounds, color=style.CYCLE[k], alpha=0.18, linewidth=0)
-        axes[3].plot(
+        ax.fill_between(*bounds, color=style.CYCLE[k], alpha=0.18, linewidth=0)
+        ax.plot(
             *decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
         )
-    axes[3].set_ylim(-1.2 * reach / size, 1.2 * reach / size)
-    axes[3].set_ylabel(f"gyro bias, {unit}")
-    style.legend_above(axes[3])
-    total = np.linalg.norm(sigma[:, :3], axis=1)
-    unit, size = angle_unit(total[settled])
+    ax.set_ylim(-1.2 * reach / size, 1.2 * reach / size)
+    ax.set_ylabel(f"gyro bias, {unit}")
+    style.legend_above(ax)
+
+
+def _attitude_sigma(ax: Axes, estimate: Estimate) -> None:
+    """Draw the σ of the attitude over time."""
+    total = np.linalg.norm(estimate.sigma[:, :3], axis=1)
+    settled = total[len(total) // 20 :]
+    unit, size = angle_unit(settled)
     words = "root sum square of the three axes"
     # A line that follows the changes of σ between measurements would be a black area.
     edges, least, most = envelope(estimate.time, total / size)
-    axes[4].fill_between(edges, least, most, color=style.SKY, linewidth=0)
-    axes[4].plot(edges, most, color=style.ink(), linewidth=0.8)
+    ax.fill_between(edges, least, most, color=style.SKY, linewidth=0)
+    ax.plot(edges, most, color=style.ink(), linewidth=0.8)
     if len(total) > BAND_COLUMNS:
         words += ", minimum to maximum of each pixel"
-    axes[4].set_ylabel(f"attitude σ, {unit}")
-    axes[4].set_title(words, loc="right", fontsize="small")
-    if total.max() > 5.0 * total[settled].max():  # a large initial σ would make the rest unreadable
-        style.log_scale(axes[4])
-        axes[4].set_ylim(bottom=0.4 * total.min() / size)  # a label below the curve
+    ax.set_ylabel(f"attitude σ, {unit}")
+    ax.set_title(words, loc="right", fontsize="small")
+    if total.max() > 5.0 * settled.max():  # a large initial σ would make the rest unreadable
+        style.log_scale(ax)
+        ax.set_ylim(bottom=0.4 * total.min() / size)  # a label below the curve
     else:
-        axes[4].set_ylim(bottom=0.0)
-    axes[4].set_xlabel("time, s")
-    axes[4].set_xlim(estimate.time[0], estimate.time[-1])
-    axes[0].set_title(title, loc="left")
-    return figure
+        ax.set_ylim(bottom=0.0)
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:

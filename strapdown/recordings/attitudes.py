@@ -2,7 +2,7 @@
 
 ``read_attitudes`` recognises formats by content:
 
-- results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
+- results of this package (HDF5): estimate, simulated record (its truth);
 - the reference of a recording (BROAD, EuRoC folder, Parquet), TUM trajectories (no covariance) and EuRoC's ground truth;
 - CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
 - ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
@@ -148,16 +148,18 @@ def _own(path: Path, kind: str) -> Attitudes:
     """Read a result of this package, of this kind."""
     if kind == "strapdown estimate":
         with reading.hdf5(path) as file:
-            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude", "variance")}
-            size = arrays["variance"].shape[1]
+            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude")}
             P = reading.numbers(file, "covariance") if "covariance" in file else None
+            if P is None and "variance" in file:
+                variance = reading.numbers(file, "variance")
+                P = variance[:, :, None] * np.eye(variance.shape[1])
             bias = reading.numbers(file, "bias") if "bias" in file else None
         return Attitudes(
             source=path.name,
             stamps_ns=_whole_ns(arrays["time"]),
             attitude=quaternion.normalize(arrays["attitude"]),
-            covariance=arrays["variance"][:, :, None] * np.eye(size) if P is None else P,
-            error_frame="body",
+            covariance=P,
+            error_frame="" if P is None else "body",
             bias=bias,
         )
     if kind == recordfiles.KIND:
@@ -167,10 +169,6 @@ def _own(path: Path, kind: str) -> Attitudes:
         return Attitudes(
             source=path.name, stamps_ns=_whole_ns(record.time), attitude=record.truth.attitude, bias=record.truth.bias
         )
-    if kind == "strapdown attitude":
-        with reading.hdf5(path) as file:
-            time, q = reading.numbers(file, "time"), reading.numbers(file, "attitude")
-        return Attitudes(source=path.name, stamps_ns=_whole_ns(time), attitude=q)
     raise InputError(
         f"{path} is a {kind}, which has no attitudes over time; give an estimate, a record or a trajectory"
     )

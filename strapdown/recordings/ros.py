@@ -333,11 +333,8 @@ def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> N
         )
     rows, q = places[same], estimate.attitude[same]
     imu[rows, 0:4] = q[:, [1, 2, 3, 0]]
-    body = np.zeros((len(q), 3, 3))
-    if estimate.covariance is not None:
-        body[:] = estimate.covariance[same, :3, :3]
-    else:
-        body[:, [0, 1, 2], [0, 1, 2]] = estimate.variance[same, :3]
+    P = estimate.attitude_covariance
+    body = np.zeros((len(q), 3, 3)) if P is None else P[same]
     turn = quaternion.to_matrix(q)
     imu[rows, 4:13] = (turn @ body @ np.swapaxes(turn, 1, 2)).reshape(-1, 9)
 

@@ -13,6 +13,6 @@ from strapdown.records import outputs
 from strapdown.records.estimate import ErrorStateEstimate, Estimate, Event, Innovations
 from strapdown.records.record import LARGEST_TURN, ImuRecord, Origin, Truth, compress, cut
 from strapdown.records.recording import Recording
-from strapdown.records.result_files import CONVENTIONS, put, read_attributes, result_file, write_attitude
+from strapdown.records.result_files import CONVENTIONS, put, read_attributes, result_file
 
 __all__ = ["ErrorStateEstimate", "Estimate", "Event", "ImuRecord", "Innovations", "Origin", "Truth", "compress"]

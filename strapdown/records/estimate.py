@@ -194,11 +194,11 @@ class Estimate(ByValue, Listed):
     attitude : ndarray (m, 4)
         Unit quaternions q_fb.
     bias : ndarray (m, 3)
-        Gyro bias, rad/s, body axes.
+        Gyro bias, rad/s, body axes. NaN if it is not estimated.
     variance : ndarray (m, 6)
-        Diagonal of P: attitude error, rad², body axes; bias error, (rad/s)².
+        Diagonal of P: attitude error, rad², body axes; bias error, (rad/s)². NaN if it is not known.
     covariance : ndarray (m, 6, 6), optional
-        Full P of (δθ, δb), if requested.
+        Full P of (δθ, δb), if requested. NaN if it is not known.
     innovations : mapping of str to Innovations, default empty
         Innovations by sensor.
     skipped : mapping of str to int, default empty
@@ -358,6 +358,11 @@ class Estimate(ByValue, Listed):
         """Whether a gyro bias is estimated."""
         return bool(np.isfinite(self.bias).any())
 
+    @property
+    def has_covariance(self) -> bool:
+        """Whether σ of the attitude is known."""
+        return bool(np.isfinite(self.variance[:, :3]).any())
+
     def errors(
         self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
     ) -> Array:
@@ -402,8 +407,10 @@ class Estimate(ByValue, Listed):
         return np.sqrt(self.variance)
 
     @property
-    def attitude_covariance(self) -> Array:
-        """Covariance (m, 3, 3) of the attitude error, rad², body axes; diagonal if only variances were stored."""
+    def attitude_covariance(self) -> Array | None:
+        """Covariance (m, 3, 3) of the attitude error, rad², body axes; diagonal if only variances were stored; None if not known."""
+        if not self.has_covariance:
+            return None
         if self.covariance is not None:
             return np.asarray(self.covariance[:, :3, :3])
         return np.asarray(self.variance[:, :3, None] * np.eye(3))
@@ -478,27 +485,28 @@ class Estimate(ByValue, Listed):
             columns = {"time_ns": np.rint(self.time * 1e9).astype(np.int64) + recording.epoch_ns}
         columns |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
-        assert angles.sigma is not None
         axes = sequence.upper()
         for k, axis in enumerate(axes):
             name = _NAMES[axis] if len(set(axes)) == 3 else f"angle_{k + 1}_{axis.lower()}"
             columns[f"{name}_deg"] = angles.angles[:, k] / DEGREE
-            columns[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
+            if angles.sigma is not None:
+                columns[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
         north = outputs.heading(self.attitude, P)
-        assert north.sigma is not None
-        columns |= {"heading_deg": north.angles / DEGREE, "heading_sigma_deg": north.sigma / DEGREE}
+        columns["heading_deg"] = north.angles / DEGREE
+        if north.sigma is not None:
+            columns["heading_sigma_deg"] = north.sigma / DEGREE
         sigma = self.sigma
-        for k, axis in enumerate("xyz"):
+        for k, axis in enumerate("xyz" if self.has_bias else ""):
             columns[f"bias_{axis}_deg_per_h"] = self.bias[:, k] / DEGREE_PER_HOUR
             columns[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
-        if self.covariance is not None:
+        if self.covariance is not None and P is not None:
             size = 6 if np.isfinite(self.covariance[:, 3:, 3:]).any() else 3
             for i, j in itertools.combinations_with_replacement(range(size), 2):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
                 columns[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = self.covariance[:, i, j]
         if recording is not None:
             rows = recording.rows_of(self.time)
-            rate = recording.rate[rows] - self.bias
+            rate = recording.rate[rows] - (self.bias if self.has_bias else 0.0)
             columns |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
             if recording.specific_force is not None:
                 free = outputs.free_acceleration(self.attitude, recording.specific_force[rows])

@@ -1,4 +1,4 @@
-"""Self-describing HDF5 files of results: what all of them have in common, and integrated attitudes."""
+"""Self-describing HDF5 files of results: what all of them have in common."""
 
 from __future__ import annotations
 
@@ -42,15 +42,6 @@ def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> No
         options = {"chunks": chunks, "compression": "gzip", "compression_opts": 1, "shuffle": True}
     dataset = group.create_dataset(name, data=value, **options)
     set_attributes(dataset, {"unit": unit, "meaning": meaning} if meaning else {"unit": unit})
-
-
-def write_attitude(
-    path: str | os.PathLike[str], time: Array, attitude: Array, attributes: Mapping[str, Any] | None = None
-) -> None:
-    """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file is created only when complete."""
-    with result_file(path, "attitude", attributes) as file:
-        put(file, "time", time, "s")
-        put(file, "attitude", attitude, "1")
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -89,14 +89,16 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
             for k, name in enumerate(angle_labels(estimate.fixed_frame))
         ]
         charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
-        unit, size = rate_unit(3.0 * sigma[settled, 3:])
-        series = [
-            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
-        ]
-        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
-        spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
-        series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
-        charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
+        if estimate.has_bias:
+            unit, size = rate_unit(3.0 * sigma[settled, 3:])
+            series = [
+                page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
+            ]
+            charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
+        if estimate.has_covariance:
+            spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
+            series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
+            charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
     return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
 
 

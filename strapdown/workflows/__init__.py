@@ -11,12 +11,11 @@ from strapdown.scenarios import simulate
 from strapdown.workflows.campaigns import monte_carlo, plan
 from strapdown.workflows.estimating import Run, estimate, smooth
 from strapdown.workflows.files import read, write
-from strapdown.workflows.integrating import AttitudeHistory, integrate
+from strapdown.workflows.integrating import integrate
 from strapdown.workflows.judging import accuracy, check, diagnose
 from strapdown.workflows.tuning import tune
 
 __all__ = [
-    "AttitudeHistory",
     "Run",
     "accuracy",
     "check",

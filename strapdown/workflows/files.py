@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strapdown import recordings, records, scenarios
+from strapdown import recordings, scenarios
 from strapdown.checks import Hint, InputError, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
@@ -18,7 +18,6 @@ from strapdown.files import reading, write_text
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord
 from strapdown.scenarios import Scenario
-from strapdown.workflows.integrating import AttitudeHistory
 
 if TYPE_CHECKING:
     from strapdown.montecarlo.campaign import Campaign
@@ -39,13 +38,13 @@ def read(
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
     gyro_alone: bool = False,
-) -> ImuRecord | Recording | Estimate | AttitudeHistory | Campaign:
+) -> ImuRecord | Recording | Estimate | Campaign:
     """Read a file of any known format, identified by its content, or a table in memory.
 
     Parameters
     ----------
     path : path, DataFrame, Dataset or mapping
-        A simulated record, an estimate, an integrated attitude or a Monte Carlo of this package, or a recording in a format of
+        A simulated record, an estimate or a Monte Carlo of this package, or a recording in a format of
         :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording named as in a CSV file:
         of pandas, polars, pyarrow, xarray, a structured array, or arrays by name, of which arrays (n, 3) hold x, y and z.
     units : mapping of str to str, optional
@@ -65,7 +64,7 @@ def read(
 
     Returns
     -------
-    ImuRecord, Estimate, AttitudeHistory, Campaign or Recording
+    ImuRecord, Estimate, Campaign or Recording
         A record has its ``origin``; the ``remarks`` of a recording list the choices of the reader.
 
     Raises
@@ -88,7 +87,6 @@ def read(
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
     kinds = {recordfiles.KIND: "a record", "strapdown estimate": "an estimate", "strapdown montecarlo": "a Monte Carlo"}
-    kinds["strapdown attitude"] = "an attitude"
     kind = kinds.get(reading.kind(file), "")
     if not kind:
         return recordings.read(file, gyro_alone=gyro_alone, **options)
@@ -98,27 +96,21 @@ def read(
         return recordfiles.read_record(file)
     if kind == "an estimate":
         return setups.read_estimate(file)
-    if kind == "an attitude":
-        with reading.hdf5(file) as held:
-            arrays: dict[str, Any] = {name: reading.numbers(held, name) for name in ("time", "attitude")}
-            known = reading.attributes(held)
-        words = {name: known.get(name, "") for name in ("source", "algorithm")}
-        return AttitudeHistory(**arrays, **words, remarks=tuple(known.get("remarks", ())))
     from strapdown.montecarlo import campaign
 
     return campaign.read(file)
 
 
 def write(
-    content: ImuRecord | Recording | Estimate | AttitudeHistory | Scenario | FilterSetup,
+    content: ImuRecord | Recording | Estimate | Scenario | FilterSetup,
     path: str | os.PathLike[str],
     **options: Any,
 ) -> Path:
-    """Write a record, recording, estimate, integrated attitude, scenario or filter setup to a file, atomically.
+    """Write a record, recording, estimate, scenario or filter setup to a file, atomically.
 
     Parameters
     ----------
-    content : ImuRecord, Recording, Estimate, AttitudeHistory, Scenario or FilterSetup
+    content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
         The file of a record contains its origin; a scenario that includes your own Python functions or classes is omitted.
     path : path
         The suffix selects the format: ``.h5`` holds a record or an estimate completely, with its filter, origin and truth, ``.toml`` a
@@ -137,7 +129,7 @@ def write(
     >>> import strapdown as sd
     >>> sd.write(estimate, "walk-angles.csv", sequence="ZYX")  # doctest: +SKIP
     """
-    kinds = (ImuRecord, Recording, Estimate, AttitudeHistory, Scenario, FilterSetup)
+    kinds = (ImuRecord, Recording, Estimate, Scenario, FilterSetup)
     instance("content", content, kinds, "give one of these")
     if isinstance(content, (Scenario, FilterSetup)):
         if Path(path).suffix.lower() != ".toml" or options:
@@ -149,9 +141,6 @@ def write(
     elif isinstance(content, (ImuRecord, Estimate)) and Path(path).suffix.lower() in HDF5:
         save: Callable[..., None] = setups.write_estimate if isinstance(content, Estimate) else recordfiles.write_record
         save(path, content, **options)
-    elif isinstance(content, AttitudeHistory):
-        names = ("source", "algorithm", "remarks")
-        records.write_attitude(path, content.time, content.attitude, {name: getattr(content, name) for name in names})
     else:
         recordings.write(content, path, **options)
     return Path(path)

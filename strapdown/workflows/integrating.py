@@ -2,43 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import coning, quaternion, recordings
 from strapdown.ahrs.remarks import gap_words
-from strapdown.checks import Array, InputError, instance
+from strapdown.checks import InputError, instance
 from strapdown.recordings import Recording
-from strapdown.records import ImuRecord
-from strapdown.results import ByValue
+from strapdown.records import Estimate, ImuRecord, Origin
 from strapdown.workflows.estimating import SOURCE
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AttitudeHistory(ByValue):
-    """Attitude integrated from the gyro only.
-
-    Parameters
-    ----------
-    time : ndarray (k + 1,)
-        Edges of the algorithm's steps, s.
-    attitude : ndarray (k + 1, 4)
-        q_fb.
-    source : str, default ""
-        Recording that was integrated.
-    algorithm : str, default ""
-        Name of the algorithm.
-    remarks : tuple of str, default empty
-        Its length, samples not used, the error relative to the attitude of the source, gaps.
-    """
-
-    time: Array
-    attitude: Array
-    source: str = ""
-    algorithm: str = ""
-    remarks: tuple[str, ...] = ()
 
 
 def integrate(
@@ -46,7 +18,7 @@ def integrate(
     algorithm: str | coning.Algorithm = "four-sample",
     *,
     initial_attitude: ArrayLike | None = None,
-) -> AttitudeHistory:
+) -> Estimate:
     """Integrate gyro samples to attitude, without other sensors.
 
     Parameters
@@ -60,9 +32,9 @@ def integrate(
 
     Returns
     -------
-    AttitudeHistory
+    Estimate
         ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; remaining samples are dropped.
-        ``remarks`` have the error relative to a true attitude.
+        Bias and covariance are NaN. ``remarks`` have the error relative to a true attitude, ``details`` the algorithm.
 
     Examples
     --------
@@ -101,6 +73,13 @@ def integrate(
         gaps = gap_words(recordings.gaps(source.time))
         remarks += [f"{gaps}: the rotation during a gap is interpolated."] if gaps else []
         remarks += [*source.remarks, source.left_out_words]
-    said = tuple(filter(None, remarks))
-    name = source.source if isinstance(source, Recording) else ""
-    return AttitudeHistory(time=steps, attitude=attitude, source=name, algorithm=rule.name, remarks=said)
+    return Estimate(
+        time=steps,
+        attitude=attitude,
+        bias=np.broadcast_to(np.nan, (len(steps), 3)),
+        variance=np.broadcast_to(np.nan, (len(steps), 6)),
+        covariance=np.broadcast_to(np.nan, (len(steps), 6, 6)),
+        origin=source.origin if isinstance(source, ImuRecord) else Origin(source=source.source),
+        remarks=tuple(filter(None, remarks)),
+        details={"algorithm": rule.name},
+    )

@@ -158,7 +158,7 @@ def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes 
         known = _truth_at(result, truth) or result.truth
         return accuracy_of_rows(result, known, align=known is not None and not known.has_bias)
     P = result.attitude_covariance
-    own = Series(result.time, result.attitude, P if np.isfinite(P).all() else None)
+    own = Series(result.time, result.attitude, P if P is not None and np.isfinite(P).all() else None)
     return accuracy_of(own, Series(truth.seconds(0), truth.attitude, movement=truth.movement))
 
 

@@ -52,13 +52,12 @@ def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
         path, "estimate", {**attributes, **origin_attributes(estimate.origin), **estimate.details}
     ) as file:
         size = 6 if estimate.has_bias else 3
-        known = np.isfinite(estimate.variance).any()  # an estimate of another program may be without
+        known = {"variance": np.s_[:, :size], "covariance": np.s_[:, :size, :size]}
+        unknown = (*(() if estimate.has_bias else ("bias",)), *(() if estimate.has_covariance else known))
         for name, unit in _VALUES.items():
             value = getattr(estimate, name)
-            if name in ("variance", "covariance") and value is not None:
-                value = (value[:, :size] if name == "variance" else value[:, :size, :size]) if known else None
-            if value is not None and (name != "bias" or estimate.has_bias):
-                put(file, name, value, unit)
+            if value is not None and name not in unknown:
+                put(file, name, value[known.get(name, ...)], unit)
         if truth is not None:
             _put_truth(file, truth)
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
@@ -114,8 +113,8 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
         size = 6 if "bias" in file else 3  # an estimate of another program may have none
-        variance = np.full((rows, 6), np.nan)  # an estimate of another program may have no covariance
-        covariance: Array | None = np.full((rows, 6, 6), np.nan)
+        variance = np.full((rows, 6), np.nan)  # an integrated attitude has no covariance
+        covariance: Array | None = np.broadcast_to(np.nan, (rows, 6, 6))
         if "variance" in file or "covariance" in file:
             covariance = None
             variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
