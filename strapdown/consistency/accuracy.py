@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, increasing, positive
 from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
+from strapdown.consistency.manifold import nees
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Column, Listed, Table, figure
@@ -21,7 +22,7 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 KINDS = ("total", "heading", "inclination")
 """Parts of an attitude error: its angle, its part about the vertical, the angle between the two verticals."""
-_DEGREES = {"total": 3, "heading": 1, "inclination": 2}
+_STATES = {"total": (0, 1, 2), "heading": (2,), "inclination": (0, 1)}
 REGION = 0.95
 """Probability of the regions of an error given its covariance, whose coverage is reported."""
 FITTED = 4000
@@ -297,7 +298,7 @@ def _size(kind: str, angle: Array, squares: Array | None) -> ErrorSize:
     rms, middle, most = float(np.sqrt(np.mean(angle**2))), float(np.median(angle)), float(angle.max())
     if squares is None:
         return ErrorSize(rms, middle, most)
-    degrees = _DEGREES[kind]
+    degrees = len(_STATES[kind])
     inside = float(np.mean(squares <= chdtri(degrees, 1.0 - REGION)))
     return ErrorSize(rms, middle, most, inside, float(np.sqrt(np.mean(squares) / degrees)))
 
@@ -307,8 +308,4 @@ def _normalised(attitude: Array, true_attitude: Array, P: Array) -> dict[str, Ar
     R = quaternion.to_matrix(attitude)
     C = R @ P @ np.swapaxes(R, 1, 2)
     error = quaternion.log(quaternion.multiply(true_attitude, quaternion.conjugate(attitude)))
-    parts = {"total": slice(3), "heading": slice(2, 3), "inclination": slice(2)}
-    return {
-        kind: np.einsum("mi,mi->m", error[:, rows], np.linalg.solve(C[:, rows, rows], error[:, rows, None])[:, :, 0])
-        for kind, rows in parts.items()
-    }
+    return {kind: nees(error, C, states) for kind, states in _STATES.items()}

@@ -31,7 +31,7 @@ from strapdown.consistency.alignment import (
     turns,
 )
 from strapdown.consistency.bounds import mean_p_value
-from strapdown.consistency.judgement import DETECTABLE, Judgement, judge
+from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.records import Estimate, Innovations, Origin, Truth
@@ -371,14 +371,11 @@ def explanations(
         *_zero_bias(own, truth, P),
         *_other_frames(error, readings, frame, probabilities),
     ]
-    order = sorted(candidates, key=lambda candidate: candidate.p_value)
-    for rank, explanation in enumerate(order):  # Holm
-        if explanation.p_value > (1.0 - confidence_level) / (len(order) - rank):
-            break
-        order[rank] = replace(explanation, likely=True)
+    likely = holm([candidate.p_value for candidate in candidates], 1.0 - confidence_level)
+    marked = [replace(candidate, likely=is_likely) for candidate, is_likely in zip(candidates, likely, strict=True)]
     # Specific causes come before a factor on σ, which would absorb all of them.
     return tuple(
-        sorted(order, key=lambda explanation: (not explanation.likely, explanation.name == SCALE, explanation.p_value))
+        sorted(marked, key=lambda explanation: (not explanation.likely, explanation.name == SCALE, explanation.p_value))
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -516,12 +516,13 @@ def concluded(
     ``parts``: reason by part (:class:`Part`) why no test covers it, empty if one does; ``unmodelled``: errors that the filter has no state
     for; ``runs``: the runs, in words; ``agree``: what is said of the parts that were tested.
     """
-    marked = holm(findings, 1.0 - confidence_level)
-    kept = sum(not finding.rejected for finding in marked)
+    contradicts = holm([finding.p_value for finding in findings], 1.0 - confidence_level)
     # Bounds at the significance level at which Holm's procedure has stopped.
-    level = (1.0 - confidence_level) / max(kept, 1)
-    bounds = [finding._bounds(level) for finding in marked]
-    marked = [replace(finding, low=low, high=high) for finding, (low, high) in zip(marked, bounds, strict=True)]
+    level = (1.0 - confidence_level) / max(contradicts.count(False), 1)
+    marked = []
+    for finding, is_rejected in zip(findings, contradicts, strict=True):
+        low, high = finding._bounds(level)
+        marked.append(replace(finding, rejected=is_rejected, low=low, high=high))
     errors = detectable_errors(marked, confidence_level)
     tested = tuple(Part(of=of, detectable_error=errors.get(of, math.inf), why=why) for of, why in parts.items())
     rejected = [finding for finding in marked if finding.rejected]
@@ -607,15 +608,14 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join([*([", ".join(names[:-1])] if names[1:] else []), *names[-1:]])
 
 
-def holm(findings: Iterable[Finding], error: float) -> list[Finding]:
-    """Return the findings with those marked that Holm's step-down procedure rejects at a family-wise error of ``error``."""
-    marked = [replace(finding, rejected=False) for finding in findings]
-    order = sorted(range(len(marked)), key=lambda k: marked[k].p_value)
-    for rank, k in enumerate(order):
-        if not marked[k].p_value <= error / (len(marked) - rank):
+def holm(p_values: Sequence[float], error: float) -> list[bool]:
+    """Return which p-values Holm's step-down procedure rejects at a family-wise error of ``error``."""
+    rejected = [False] * len(p_values)
+    for rank, k in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        if not p_values[k] <= error / (len(p_values) - rank):
             break
-        marked[k] = replace(marked[k], rejected=True)
-    return marked
+        rejected[k] = True
+    return rejected
 
 
 def state_name(state: int) -> str:

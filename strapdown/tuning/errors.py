@@ -17,6 +17,7 @@ import numpy as np
 
 from strapdown import consistency
 from strapdown.checks import Array, InputError
+from strapdown.consistency.alignment import turns
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.innovations import Likelihood, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, make_problem
@@ -133,9 +134,7 @@ def _spread(base: Likelihood, number: int) -> Reference:
     if m < 100:
         return picked
     attitude, _, P = base.estimates(number, base.start[None], picked.epochs)
-    none = np.zeros((m, 3))
-    error = consistency.errors(attitude[:, 0], none, picked.attitude, none)[:, :3]
-    white = error / np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
+    white = turns(attitude[:, 0], picked.attitude) / np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
     lag = 1
     while lag < m // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
         lag += 1

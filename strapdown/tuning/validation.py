@@ -200,7 +200,7 @@ def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance
         squares += float(innovations.nis[innovations.used].sum())
     nees, error_squares = [], []
     for estimate, truth in judged:
-        if truth is not None and _knows_bias(truth):
+        if truth is not None and truth.has_bias:
             error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
             assert estimate.covariance is not None
             nees.append(consistency.nees(error, estimate.covariance))
@@ -215,15 +215,11 @@ def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance
         anees=float(np.mean(np.concatenate(nees)) / 6.0) if nees else float("nan"),
         attitude_rms=float(np.sqrt(np.mean(np.concatenate(error_squares)))) if error_squares else float("nan"),
         judgements=tuple(
-            consistency.judge(estimate, truth if truth is not None and _knows_bias(truth) else None)
+            consistency.judge(estimate, truth if truth is not None and truth.has_bias else None)
             for estimate, truth in judged
         ),
         courses=(_nis_course(judged[0][0].innovations.values()), *_nees_courses(*judged[0])),
     )
-
-
-def _knows_bias(truth: Truth) -> bool:
-    return bool(np.isfinite(truth.bias).any())
 
 
 def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | None]:
@@ -237,7 +233,7 @@ def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | No
         attitude = reference[edges][: len(record.time)].copy()
         if case.judged is not None:
             attitude[~case.judged[edges][: len(record.time)]] = np.nan
-        truth = Truth(attitude=attitude, bias=np.full((len(attitude), 3), np.nan))
+        truth = Truth.of_reference(attitude)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     estimate = setup.run_modelled(record, used, initial, every=every, full_covariance=truth is not None)
 
@@ -249,7 +245,7 @@ def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | No
     values = {name: getattr(estimate, name) for name in ("time", "attitude", "bias", "variance", "covariance")}
     part: dict[str, Any] = {name: value[inside] for name, value in values.items() if value is not None}
     if truth is not None:
-        truth = Truth(attitude=truth.attitude[::every][inside], bias=truth.bias[::every][inside])
+        truth = truth.taken(slice(None, None, every)).taken(inside)
     return replace(estimate, innovations=innovations, **part), truth
 
 
@@ -279,21 +275,15 @@ def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[Course, ...]
     if truth is None or known is None or int(known.sum()) < MIN_ERRORS:
         return ()
     assert estimate.covariance is not None
-    whole = _knows_bias(truth)
-    bias = truth.bias if whole else estimate.bias
-    error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], bias[known])
-    time, P = estimate.time[known], estimate.covariance[known]
+    size = 6 if truth.has_bias else 3
+    error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known])
+    time, error, P = estimate.time[known], error[:, :size], estimate.covariance[known, :size, :size]
     middles, place = _spans(time, time[0], time[-1])
     number = np.bincount(place, minlength=BINS)
     courses = []
-    for name in ("attitude", "bias") if whole else ("attitude",):
+    for name in ("attitude", "bias") if truth.has_bias else ("attitude",):
         states = consistency.SUBSETS[name]
-        # If the bias is known too, the correlation is estimated from all states.
-        average = (
-            consistency.time_average(error, P, states)
-            if whole
-            else consistency.time_average(error[:, :3], P[:, :3, :3])
-        )
+        average = consistency.time_average(error, P, states)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(place, consistency.nees(error, P, states), BINS) / (len(states) * number)
         # Errors of one run are correlated: of those in a bin fewer are independent.

@@ -92,5 +92,5 @@ def compare(
             "bound is given, but the record has no truth, so there are no errors to compare with it; leave bound out"
         )
     least = None if bound is None else array("bound", bound, (len(record.time[::every]), 6, 6))
-    kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
+    kept = None if truth is None else truth.taken(slice(None, None, every))
     return Comparison(estimates=estimates, truth=kept, bound=least)

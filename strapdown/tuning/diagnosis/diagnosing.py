@@ -11,7 +11,7 @@ from strapdown.checks import InputError
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import ImuRecord
 from strapdown.tuning.diagnosis.causes import Diagnosis
 from strapdown.tuning.diagnosis.commutation import commutation
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
@@ -64,7 +64,7 @@ def diagnose(
     model = Model(record=replace(modelled, truth=None), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
-    kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
+    kept = None if truth is None else truth.taken(slice(None, None, every))
     if judgement is None:
         judgement = consistency.judge(estimate, kept, confidence_level=probability)
     base = run(model)
