@@ -369,7 +369,9 @@ class Outcome:
     @property
     def convergence_time(self) -> float:
         """Time from which on 90 % of the runs are converged, s; NaN if never."""
-        return consistency.convergence_time(self.time, np.quantile(self.error, 0.9, axis=0), CONVERGED)
+        slowest = np.quantile(self.error, 0.9, axis=0)
+        first = np.where(slowest > CONVERGED, np.arange(1, 1 + len(self.time)), 0).max()
+        return float(np.append(self.time, np.nan)[first])
 
     @property
     def final_rms(self) -> float:

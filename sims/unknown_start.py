@@ -72,7 +72,8 @@ class Outcome:
     @property
     def convergence(self) -> Array:
         """Time of each run after which its error stays below 1° (runs,), s; NaN if it does not."""
-        return np.array([consistency.convergence_time(self.time, error, CONVERGED) for error in self.error])
+        first = np.where(self.error > CONVERGED, np.arange(1, 1 + len(self.time)), 0).max(axis=1)
+        return np.append(self.time, np.nan)[first]
 
     @property
     def anees(self) -> Array:

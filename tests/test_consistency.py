@@ -340,13 +340,6 @@ def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
 # ------------------------------------------------------------------------------------------------------------------ accuracy
 
 
-def test_convergence_time_is_that_of_the_last_excursion():
-    time = np.arange(6.0)
-    assert consistency.convergence_time(time, [5.0, 1.0, 3.0, 1.0, -1.0, 0.5], 1.0) == 3.0
-    assert consistency.convergence_time(time, np.zeros(6), 1.0) == 0.0
-    assert math.isnan(consistency.convergence_time(time, [0, 0, 0, 0, 0, 2.0], 1.0))
-
-
 @pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
 def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
     """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""

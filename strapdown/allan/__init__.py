@@ -17,7 +17,6 @@ from strapdown.allan.noise_fit import (
     UNITS,
     NoiseFit,
     curves_by_axis,
-    expected_errors,
     fit_noise,
     table,
     to_gyro_parameters,

@@ -30,13 +30,11 @@ from strapdown.allan.spectrum import (
     Bins,
     Segment,
     bin_slices,
-    bin_starts,
     binned,
     cosine_transform,
     expected_power,
     inner,
     last_coefficient,
-    mean_power,
     ramp_coefficients,
     scored,
     segment,
@@ -317,38 +315,6 @@ def without_gaps(known: NDArray[np.bool_]) -> list[slice]:
     """Return the segments of at least :data:`SHORTEST` samples between gaps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
-
-
-def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
-    """Return the expected standard errors, SI, of a fit of all terms, for choosing the duration of a record.
-
-    ``parameters`` are coefficients, SI, by name in :data:`TERMS`. The errors are the Cramér–Rao bound of the cosine coefficients, which the
-    fit attains if an error is well below the coefficient; otherwise the record does not support the term.
-    """
-    checks.known_keys("parameters", parameters, TERMS)
-    dt = checks.positive("sample_interval", sample_interval, unit="s")
-    last = checks.count("samples", samples, minimum=64) - 1
-    starts = bin_starts(last)
-    random_terms = TERMS[:4]
-    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
-    slices = bin_slices(starts, last)
-    number = np.array([float(s.stop - s.start) for s in slices])
-    theta = np.array([checks.non_negative(term, parameters.get(term, 0.0)) ** 2 for term in random_terms])
-    if not np.any(theta > 0.0):
-        raise InputError("parameters names no random noise; give one of quantization, angle_random_walk, …")
-    variance = theta @ basis
-    none = np.zeros_like(number)
-    inverse = _inverse(_information(Bins(number, none, none, none, basis, 0.0), variance))
-    errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    expected = {
-        term: float(0.5 * error / math.sqrt(value))  # d√θ/dθ
-        for term, error, value in zip(random_terms, errors, theta, strict=True)
-        if value > 0.0
-    }
-    if parameters.get("rate_ramp", 0.0) != 0.0:
-        ramp = [float(np.sum((dt * ramp_coefficients(samples, np.arange(s.start, s.stop))) ** 2)) for s in slices]
-        expected["rate_ramp"] = 1.0 / math.sqrt(float(np.sum(np.array(ramp) / variance)))
-    return expected
 
 
 def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, Array]]:

@@ -4,14 +4,14 @@
 - ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
 - ``whiteness``: Tests of the innovations: white, normal, of mean zero, independent of those of other sensors.
 - ``timeaverage``: Averages over the time of one run, whose errors are correlated, and their effective sample size.
-- ``accuracy``: Errors against a truth or a reference, in one table; their convergence time.
+- ``accuracy``: Errors against a truth or a reference, in one table.
 - ``alignment``: Clocks and frames of an estimate and a truth.
 - ``foreign``: The verdict on the estimate of another program: alignment of clocks and frames, definition of its covariance.
 - ``judgement``: The verdict in words, with its evidence, at a stated probability of a false alarm. For independent runs see
   :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 
-from strapdown.consistency.accuracy import Accuracy, ReferenceErrors, convergence_time, reference_errors
+from strapdown.consistency.accuracy import Accuracy, ReferenceErrors, reference_errors
 from strapdown.consistency.bounds import (
     Verdict,
     log_mean_bounds,

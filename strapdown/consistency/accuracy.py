@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, increasing, positive
+from strapdown.checks import Array, InputError, array
 from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
 from strapdown.consistency.manifold import nees
 from strapdown.files import plain
@@ -27,15 +27,6 @@ REGION = 0.95
 """Probability of the regions of an error given its covariance, whose coverage is reported."""
 FITTED = 4000
 """Maximum number of attitudes from which clocks and frames are aligned."""
-
-
-def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
-    """Return the time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does."""
-    stamps = increasing("time", time)
-    size = array("magnitude", magnitude, (len(stamps),))
-    above = np.flatnonzero(np.abs(size) > positive("threshold", threshold))
-    first = int(above[-1]) + 1 if len(above) else 0
-    return float(stamps[first]) if first < len(stamps) else math.nan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
