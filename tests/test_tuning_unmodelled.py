@@ -47,13 +47,14 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
     for seed in (1, 2):
         case, result = tuned(seed, 1e-3)
         bare = dataclasses.replace(case, record=dataclasses.replace(case.record, truth=None))
-        unmodelled = tuning.unmodelled(bare, result.setup)
+        examined = tuning.examined([bare], result.setup, result)
+        (unmodelled,) = examined.unmodelled
         assert unmodelled.moves_with_the_rate
         size = unmodelled.scale_factor
         assert np.all(np.abs(size.estimate - 1e-3) < 4.0 * size.standard_error)
         assert np.all(size.standard_error[:2] < 4e-4)
         assert any("scale factor of the gyro" in words for words in unmodelled.words)
-        notes = {parameter.name: parameter.note for parameter in tuning.with_misfit_flag(result, unmodelled).parameters}
+        notes = {parameter.name: parameter.note for parameter in examined.parameters}
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
         assert json.dumps(unmodelled.summary())
@@ -69,12 +70,13 @@ def test_of_right_filters_hardly_one_is_suspected():
     suspected, gains = 0, []
     for seed in range(10, 13):
         case, result = tuned(seed)
-        unmodelled = tuning.unmodelled(case, result.setup)
+        examined = tuning.examined([case], result.setup, result)
+        (unmodelled,) = examined.unmodelled
         suspected += unmodelled.suspected
         gains.append(unmodelled.scale_factor.gain)
         if not unmodelled.suspected:
             assert unmodelled.words == ()
-            assert tuning.with_misfit_flag(result, unmodelled) is result
+            assert examined.parameters is result.parameters
     assert suspected <= 1
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
 

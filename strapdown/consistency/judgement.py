@@ -375,8 +375,6 @@ def ratio(
 
 def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
     samples, degrees = white.shape
-    if samples == 0:
-        return []
     mean = float(nis.mean() / degrees)
     size = ratio("NIS", sensor, mean, degrees, samples, innovation_words(sensor, mean))
     if samples < MIN_SAMPLES:

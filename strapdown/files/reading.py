@@ -474,16 +474,20 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list) else value
 
 
+def place(group: Any, name: str) -> str:
+    """Return the file and the path of a member of an HDF5 group, for messages."""
+    return f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
+
+
 def numbers(group: Any, name: str) -> np.ndarray[Any, Any]:
     """Return an array of numbers of an HDF5 group."""
     import h5py
 
-    place = f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
     if name not in group:
-        raise InputError(f"{place} is missing; the file is damaged, make it again")
+        raise InputError(f"{place(group, name)} is missing; the file is damaged, make it again")
     node = group[name]
     if isinstance(node, h5py.Group):
-        raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
+        raise InputError(f"{place(group, name)} is a group and not an array; the file is damaged, make it again")
     if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiub" or node.shape is None:
-        raise InputError(f"{place} is not an array of numbers; the file is damaged, make it again")
+        raise InputError(f"{place(group, name)} is not an array of numbers; the file is damaged, make it again")
     return np.asarray(node[()])

@@ -154,9 +154,7 @@ def _values(group: Any, name: str, unit: str) -> Array:
     value = reading.numbers(group, name)
     own = reading.attributes(group[name]).get("unit", unit)
     if own != unit:
-        raise InputError(
-            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {own!r}, but must be in {unit!r}; convert it"
-        )
+        raise InputError(f"{reading.place(group, name)} is in {own!r}, but must be in {unit!r}; convert it")
     return value
 
 

@@ -30,7 +30,7 @@ from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import Case
 from strapdown.tuning.outliers import GATED, TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names, priors_from_gyro, unit_of, values_of, with_values
-from strapdown.tuning.residual_checks import Unmodelled, examined, unmodelled, with_misfit_flag
+from strapdown.tuning.residual_checks import Unmodelled, examined, unmodelled
 from strapdown.tuning.validation import Comparison, compare, split
 
 __all__ = [

@@ -162,8 +162,11 @@ MAX_EXAMINED = 4
 """Maximum number of records examined for errors that the tuned filter does not model."""
 
 
-def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> tuple[Unmodelled, ...]:
-    """Return tests of each record for errors that the tuned filter does not model; none if its states model such errors already."""
+def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> Tuning:
+    """Return a tuning with tests of each record for errors that the filter does not model; without if its states model them already.
+
+    The random walk of the bias has a note if a scale factor explains the innovations better.
+    """
     series = [vectors for case in cases for vectors in case.record.vectors]
     by_axis = any(  # the search for causes supports one σ per sample only
         vectors.anisotropic
@@ -171,8 +174,16 @@ def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> tupl
         for vectors in series
     )
     if before.states is not None or by_axis:
-        return ()
-    return tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
+        return tuning
+    tested = tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
+    parameters = tuning.parameters
+    if any(check.moves_with_the_rate for check in tested):
+        doubt = "in doubt: may cover a scale factor of the gyro"
+        parameters = tuple(
+            replace(parameter, note=doubt) if parameter.name == RRW and parameter.identified else parameter
+            for parameter in parameters
+        )
+    return replace(tuning, parameters=parameters, unmodelled=tested)
 
 
 def record_for_tuning(case: Case) -> ImuRecord:
@@ -208,17 +219,3 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
         gain = cause.gain + min(base.gain_over(tuned), 0.0) - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))
         causes.append(replace(cause, gain=gain, log_p=min(0.0, log_p(gain, 3) + math.log(len(levels)))))
     return max(causes, key=lambda cause: cause.gain)
-
-
-def with_misfit_flag(tuning: Tuning, check: Unmodelled) -> Tuning:
-    """Return the tuning with a note on the random walk of the bias if a scale factor explains the innovations better."""
-    if not check.moves_with_the_rate:
-        return tuning
-    doubt = "in doubt: may cover a scale factor of the gyro"
-    return replace(
-        tuning,
-        parameters=tuple(
-            replace(parameter, note=doubt) if parameter.name == RRW and parameter.identified else parameter
-            for parameter in tuning.parameters
-        ),
-    )

@@ -110,11 +110,8 @@ def tune(
     objective = _objective(train, setup, names, truth=truth, gate=gate, spacing=spacing, threads=threads)
     at_once = 1 if truth and len(train) > 1 else threads  # searches, unless records are evaluated in parallel
     result = tuning.fit(objective, priors=priors, starts=starts, seed=seed, threads=at_once, progress=progress)
-    result = _completed(result, objective, setup, held, threads)
-    unmodelled = tuning.examined(train, setup, result)
-    if unmodelled:
-        result = tuning.with_misfit_flag(result, max(unmodelled, key=lambda check: check.severity))
-    return dataclasses.replace(result, unmodelled=unmodelled, remarks=tuple(remarks))
+    result = tuning.examined(train, setup, _completed(result, objective, setup, held, threads))
+    return dataclasses.replace(result, remarks=tuple(remarks))
 
 
 def _by_name(sources: Source | Sequence[Source] | Mapping[str, Source]) -> Mapping[str, Source]:

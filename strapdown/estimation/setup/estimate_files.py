@@ -109,7 +109,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             raise InputError(
                 f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
             )
-        time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
+        time = increasing(reading.place(file, "time"), _numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
         size = 6 if "bias" in file else 3  # an estimate of another program may have none
@@ -117,11 +117,11 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         covariance: Array | None = np.broadcast_to(np.nan, (rows, 6, 6))
         if "variance" in file or "covariance" in file:
             covariance = None
-            variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
+            variance = _above_zero(reading.place(file, "variance"), _numbers(file, "variance", (rows, size)))
             variance = _padded(variance, ((0, 0), (0, 6 - size)))
         if "covariance" in file:
             covariance = _numbers(file, "covariance", (rows, size, size))
-            _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
+            _above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
             covariance = _padded(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)))
         return Estimate(
             time=time,
@@ -162,11 +162,7 @@ def _padded(values: Array, widths: Any) -> Array:
 
 def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
     """Return an array of a file, checked by :func:`strapdown.checks.array`."""
-    return array(_place(group, name), reading.numbers(group, name), shape)
-
-
-def _place(group: Any, name: str) -> str:
-    return f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
+    return array(reading.place(group, name), reading.numbers(group, name), shape)
 
 
 def _need(place: str, value: Array, good: Any, remedy: str) -> Array:
@@ -193,13 +189,13 @@ def _biases(group: Any, name: str, rows: int) -> Array:
         " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
         "the gyro's unit"
     )
-    return _need(_place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
+    return _need(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:
     """Return attitudes (rows, 4) unchanged, checked to be of unit norm."""
     value = _numbers(group, name, (rows, 4))
-    unit_quaternions(_place(group, name), value)
+    unit_quaternions(reading.place(group, name), value)
     return value
 
 
@@ -210,7 +206,7 @@ def _truth(file: Any, rows: int) -> Truth:
         row = _numbers(file, "truth/row", ("m",)).astype(np.intp)
         if np.any(np.diff(row, prepend=-1) <= 0) or np.any(row >= rows):
             raise InputError(
-                f"{_place(file, 'truth/row')} are not increasing rows of the estimate; the file is damaged"
+                f"{reading.place(file, 'truth/row')} are not increasing rows of the estimate; the file is damaged"
             )
     attitude = np.full((rows, 4), np.nan)
     attitude[row] = _attitudes(file, "truth/attitude", len(row))
@@ -231,7 +227,7 @@ def _innovations(part: Any) -> Innovations:
     return Innovations(
         time=_numbers(part, "time", (number,)),
         innovation=innovation,
-        variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", innovation.shape)),
+        variance=_above_zero(reading.place(part, "variance"), _numbers(part, "variance", innovation.shape)),
         weight=_numbers(part, "weight", (number,)) if "weight" in part else None,
     )
 
@@ -240,10 +236,12 @@ def _states(attributes: dict[str, Any], part: Any, rows: int) -> ErrorStateEstim
     """Return the estimate of one group of error states."""
     values = _numbers(part, "values", (rows, len(attributes["components"])))
     if len(attributes["units"]) != len(attributes["components"]):
-        raise InputError(f"{_place(part, 'units')} and components differ in number; the file is damaged, make it again")
+        raise InputError(
+            f"{reading.place(part, 'units')} and components differ in number; the file is damaged, make it again"
+        )
     return ErrorStateEstimate(
         components=tuple(map(str, attributes["components"])),
         units=tuple(map(str, attributes["units"])),
         values=values,
-        variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", values.shape)),
+        variance=_above_zero(reading.place(part, "variance"), _numbers(part, "variance", values.shape)),
     )
