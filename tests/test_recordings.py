@@ -328,8 +328,9 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
         result = CliRunner().invoke(app, command)
         assert result.exit_code == 0, result.output
         assert "2 rows without a gyro sample, the first at 1.500 s, were left out" in " ".join(result.output.split())
+    assert "2 samples are missing in 1 gaps." in recordings.read_samples(path, "gyro").remarks
     with pytest.raises(InputError, match=r"the interval after 1.49 s is 0.03 s"):
-        recordings.read_samples(path, "gyro")
+        recordings.write(read(path), tmp_path / "even.hdf5")
 
 
 @pytest.mark.parametrize(
@@ -539,7 +540,7 @@ def test_stamps_in_whole_milliseconds_have_the_mean_interval():
     recording = Recording(
         source="log", time=np.rint(1e3 * kept / 300.0) / 1e3, rate=np.ones((899, 3)), temperature=kept * 0.01
     )
-    gyro_samples = samples.samples_of(recording, gaps=True)
+    gyro_samples = samples.samples_of(recording)
     assert gyro_samples.sample_interval == pytest.approx(1.0 / 300.0, rel=1e-3)
     assert np.flatnonzero(np.isnan(gyro_samples.values[:, 0])).tolist() == [600]
     np.testing.assert_allclose(gyro_samples.temperature, 0.01 * np.arange(900))

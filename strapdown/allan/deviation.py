@@ -291,7 +291,7 @@ def confidence(level: float) -> float:
 def averaged(source: Source, sample_interval: float | None, sensor: str, kind: str) -> tuple[Array, float, float]:
     """Return the samples (n, axes), NaN for missing ones, their interval, and the factor that converts their values to rates."""
     if isinstance(source, (Recording, ImuRecord)):
-        source = recordings.samples_of(source, sensor, gaps=True)
+        source = recordings.samples_of(source, sensor)
     if isinstance(source, recordings.GyroSamples):
         if sample_interval is not None:
             raise InputError("sample_interval goes with an array; a recording has its own: leave it out")

@@ -45,7 +45,6 @@ from strapdown.results import Column, Listed, Table, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
 
-SENSORS = ("gyro", "accelerometer", "magnetometer")
 _MICRO_G = 1e-6 * units.STANDARD_GRAVITY
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
     "gyro": {
@@ -271,7 +270,7 @@ def fit_noise(
     """
     record, dt, scale = averaged(source, sample_interval, sensor, kind)
     level = confidence(level)
-    checks.one_of("sensor", sensor, SENSORS)
+    checks.one_of("sensor", sensor, UNITS)
     names = [checks.one_of("terms: term", term, TERMS) for term in terms]
     in_order = tuple(term for term in TERMS if term in names)
     random_terms = tuple(term for term in in_order if term != "rate_ramp")
@@ -358,7 +357,7 @@ def _by_name(fit: NoiseFit, values: Array, wanted: NDArray[np.bool_]) -> dict[st
 
 def name(sensor: str, term: str) -> str:
     """Return the name of a term for a sensor."""
-    return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
+    return NAMES[checks.one_of("sensor", sensor, UNITS)].get(term, term)
 
 
 def table(fit: NoiseFit) -> list[dict[str, Any]]:

@@ -43,7 +43,7 @@ def key(sensor: str, term: str) -> tuple[str, float]:
     if sensor == "gyro":
         suffix, factor = gyro.FORM[term][0]
         return f"{term}_{suffix}", factor
-    unit, factor = UNITS[checks.one_of("sensor", sensor, noise_fit.SENSORS)][term]
+    unit, factor = UNITS[checks.one_of("sensor", sensor, UNITS)][term]
     return f"{name(sensor, term)}_{_KEYS[unit]}", factor
 
 

@@ -52,9 +52,7 @@ def allan(
     output: _Output,
 ) -> None:
     """Identify the noise of a sensor from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
-    from strapdown.allan.noise_fit import SENSORS
-
-    sensors = [one_of("--sensor", sensor, SENSORS) for sensor in dict.fromkeys(options.sensor or ["gyro"])]
+    sensors = [one_of("--sensor", sensor, sd.allan.UNITS) for sensor in dict.fromkeys(options.sensor or ["gyro"])]
     if (output.kalibr or output.px4) and not {"gyro", "accelerometer"} <= set(sensors):
         raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
     positive("--factor", output.factor)
@@ -82,7 +80,7 @@ def _identified(
     recording: Path, sensor: str, samples: Samples, options: _Identification, output: _Output
 ) -> sd.allan.NoiseFit:
     """Identify the noise of one sensor; print and write the results."""
-    source = sd.recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **samples.options)
+    source = sd.recordings.read_samples(recording, sensor, rate=options.rate, **samples.options)
     specification, numbers, drawing, warm = output.files(sensor)
     paths, number = [specification, numbers], len(source.values)
     with reading.from_file(recording):

@@ -27,7 +27,7 @@ class GyroSamples:
     Parameters
     ----------
     values : ndarray (n, axes)
-        Samples, SI (rad/s, m/s², T), or increments of a gyro, rad. Missing samples are NaN, if gaps were allowed.
+        Samples, SI (rad/s, m/s², T), or increments of a gyro, rad. Missing samples are NaN.
     sample_interval : float
         Sample interval, s.
     kind : {"rate", "increments"}
@@ -53,12 +53,11 @@ def read_samples(
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
     topic: str = "",
-    gaps: bool = False,
 ) -> GyroSamples:
     """Read one sensor of a recording of any format, the gyro of a simulated record, or a NPY array (n,) or (n, 3).
 
-    ``rate``, Hz, is only for an array, whose unit is ``units[sensor]``; other options as for :func:`strapdown.read`. ``gaps``: whether gaps
-    are allowed: samples are then placed on a grid, and missing ones are NaN.
+    ``rate``, Hz, is only for an array, whose unit is ``units[sensor]``; other options as for :func:`strapdown.read`. Samples with gaps are
+    placed on a grid, and missing ones are NaN.
     """
     file, unit_of_sensor = Path(path), dict(units or {})
     one_of("sensor", sensor, SENSORS)
@@ -75,10 +74,10 @@ def read_samples(
     elif rate is not None:
         raise InputError(f"{file.name} states its own rate; drop the option rate")
     elif simulated:
-        samples = samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
+        samples = samples_of(recordfiles.read_record(file), sensor, source=file.name)
     else:
         recording = formats.read(file, units=unit_of_sensor, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
-        samples = samples_of(recording, sensor, gaps=gaps)
+        samples = samples_of(recording, sensor)
     largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
     if samples.values.shape[1] not in (1, 3):
         raise InputError(
@@ -97,13 +96,11 @@ LARGEST = 1e12
 """Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
 
 
-def samples_of(
-    content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
-) -> GyroSamples:
+def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: str = "record") -> GyroSamples:
     """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` does for a file."""
     one_of("sensor", sensor, SENSORS)
     if isinstance(content, Recording):
-        return _of_recording(content, sensor, gaps)
+        return _of_recording(content, sensor)
     if sensor == "gyro":
         interval = sample_interval(source, content.time[1:])
         temperature = None if content.temperature is None else content.temperature[1:]
@@ -115,7 +112,7 @@ def samples_of(
         raise InputError(
             f'{source}: the {sensor} of the record measures a {kinds[sensor]}, without its magnitude; simulate it with kind = "vector"'
         )
-    return _of_recording(formats.from_record(content, source), sensor, gaps)
+    return _of_recording(formats.from_record(content, source), sensor)
 
 
 def _read_array(file: Path, sensor: str, rate: float | None, unit_of_sensor: Mapping[str, str]) -> GyroSamples:
@@ -128,7 +125,7 @@ def _read_array(file: Path, sensor: str, rate: float | None, unit_of_sensor: Map
     return GyroSamples(values=axes * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate")
 
 
-def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
+def _of_recording(recording: Recording, sensor: str) -> GyroSamples:
     """Return one sensor's samples, SI; for a sensor of lower rate, only the stamps where it has samples."""
     values = getattr(recording, COLUMN_OF[sensor])
     if values is None:
@@ -142,8 +139,6 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     try:
         interval = sample_interval(recording.source, time)
     except InputError:
-        if not gaps:
-            raise
         interval, place, words = _grid(recording.source, time)
         remarks += words
         filled = np.full((place[-1] + 1, 3), np.nan)
