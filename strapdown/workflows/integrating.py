@@ -39,7 +39,7 @@ def integrate(
     Examples
     --------
     >>> import strapdown as sd
-    >>> found = sd.integrate(sd.simulate("coning"))  # doctest: +SKIP
+    >>> attitude = sd.integrate(sd.simulate("coning")).attitude  # doctest: +SKIP
     """
     rule = coning.named(algorithm)
     instance("source", source, (ImuRecord, Recording), SOURCE)
