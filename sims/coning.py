@@ -106,6 +106,6 @@ if __name__ == "__main__":
         print(
             f"{drift.algorithm:14s} drift {drift.measured / DEGREE_PER_HOUR:11.4g} °/h, mean bias error about z "
             f"{summary['bias_mean_deg_per_hour'][2]:8.3f} °/h, ANEES attitude {summary['anees_attitude']:6.3f}, bias "
-            f"{summary['anees_bias']:10.4g}: {'consistent' if outcome.consistent else 'NOT consistent'}"
+            f"{summary['anees_bias']:10.4g}: {summary['verdict']}"
         )
     print("figures:", *result.figures)

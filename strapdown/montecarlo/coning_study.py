@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
 from strapdown.checks import Array, InputError, count, positive
-from strapdown.consistency import Verdict
+from strapdown.consistency import Judgement
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
@@ -174,24 +174,17 @@ class FilterOutcome:
     """Indices of the epochs judged."""
 
     @property
-    def verdicts(self) -> dict[str, Verdict]:
-        """Test of the NEES at the judged epochs, by subset of the states."""
-        return {subset: self.statistics.verdict(self.epochs, subset) for subset in SUBSETS}
-
-    @property
-    def consistent(self) -> bool:
-        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
-        low, high = self.statistics.nis_bounds()
-        nees = all(verdict.consistent for verdict in self.verdicts.values())
-        return nees and low <= self.statistics.mean_nis <= high
+    def judgement(self) -> Judgement:
+        """Verdict on the filter, that of any Monte Carlo, at the judged epochs."""
+        return self.statistics.judge(epochs=self.epochs)
 
     def summary(self) -> dict[str, Any]:
         """Return the outcome in degrees and hours, as in ``coning.json``. ANEES and NIS are per degree of freedom.
 
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
-        The verdict compares every epoch with simultaneous bounds.
         """
-        statistics, verdicts = self.statistics, self.verdicts
+        statistics, verdict = self.statistics, self.judgement.verdict
+        nees = {subset: statistics.verdict(self.epochs, subset) for subset in SUBSETS}
         square, variance = statistics.rms_error[self.epochs] ** 2, statistics.sigma[self.epochs] ** 2
         return {
             "integration": self.integration,
@@ -201,17 +194,18 @@ class FilterOutcome:
             "bias_rms_deg_per_hour": float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR),
             "bias_sigma_deg_per_hour": float(np.sqrt(variance[:, 3:].mean()) / DEGREE_PER_HOUR),
             "bias_mean_deg_per_hour": (statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
-            "anees": float(verdicts["state"].mean.mean()),
-            "anees_bounds": list(verdicts["state"].bounds),
-            "anees_attitude": float(verdicts["attitude"].mean.mean()),
-            "anees_attitude_bounds": list(verdicts["attitude"].bounds),
-            "anees_bias": float(verdicts["bias"].mean.mean()),
-            "anees_bias_bounds": list(verdicts["bias"].bounds),
+            "anees": float(nees["state"].mean.mean()),
+            "anees_bounds": list(nees["state"].bounds),
+            "anees_attitude": float(nees["attitude"].mean.mean()),
+            "anees_attitude_bounds": list(nees["attitude"].bounds),
+            "anees_bias": float(nees["bias"].mean.mean()),
+            "anees_bias_bounds": list(nees["bias"].bounds),
             "epochs": len(self.epochs),
-            "epochs_outside": {subset: verdict.outside for subset, verdict in verdicts.items()},
+            "epochs_outside": {subset: part.outside for subset, part in nees.items()},
             "nis": statistics.mean_nis,
             "nis_bounds": list(statistics.nis_bounds()),
-            "consistent": self.consistent,
+            "verdict": verdict,
+            "consistent": verdict != "not consistent",
         }
 
 
@@ -312,7 +306,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
         Column("ANEES attitude", "anees_attitude"),
         Column("ANEES bias", "anees_bias"),
         Column("NIS", "nis"),
-        Column("verdict", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
+        Column("verdict", "verdict"),
     ]
     (low, high), (nis_low, nis_high) = (summary["filter"][0][f"{key}_bounds"] for key in ("anees_bias", "nis"))
     note = (

@@ -67,7 +67,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         s = outcome.statistics
         for ax, state, unit in ((axes[0, j], 2, ARCSECOND), (axes[1, j], 5, DEGREE_PER_HOUR)):
             errors_in_envelope(s.time, s.example_error[:, :, state] / unit, s.sigma[:, state] / unit, ax)
-        verdict = "consistent" if outcome.consistent else "NOT consistent"
+        verdict = outcome.judgement.verdict
         axes[0, j].set_title(f"{outcome.integration}:\n{verdict}", loc="left")
         late = s.sigma[len(s.time) // 10 :]
         axes[0, j].set_ylim(-1.3 * 3.0 * late[:, 2].max() / ARCSECOND, 1.3 * 3.0 * late[:, 2].max() / ARCSECOND)
@@ -93,8 +93,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     first = outcomes[0]
     percent = f"{100 * PROBABILITY:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        verdicts = [outcome.verdicts[subset] for outcome in outcomes]
-        bounds = verdicts[0].simultaneous_bounds
+        bounds = first.statistics.verdict(first.epochs, subset).simultaneous_bounds
         nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
         ax.plot(
             first.statistics.time[first.epochs],
@@ -105,19 +104,24 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
             transform=ax.get_xaxis_transform(),
             label="judged epoch",
         )
-        passing = sum(verdict.consistent for verdict in verdicts)
-        ax.set_title(f"{subset.capitalize()}: {passing} of {len(outcomes)} pass\nTest of the judged epochs", loc="left")
+        ax.set_title(
+            f"{subset.capitalize()}: {_passing(outcomes, 'ANEES', subset)}\nTest of the judged epochs", loc="left"
+        )
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
     nis_over_time(named, axes[2], label=f"NIS: {percent} bounds, each interval")
-    within = [
-        low <= outcome.statistics.mean_nis <= high
-        for outcome in outcomes
-        for low, high in [outcome.statistics.nis_bounds()]
-    ]
-    axes[2].set_title(f"NIS: {sum(within)} of {len(outcomes)} pass\nTest of the mean over all time", loc="left")
+    axes[2].set_title(f"NIS: {_passing(outcomes, 'NIS')}\nTest of the mean over all time", loc="left")
     style.legend_below(figure, list(axes))
     return figure
+
+
+def _passing(outcomes: Sequence[FilterOutcome], statistic: str, of: str = "") -> str:
+    """Return how many of the filters a statistic does not contradict, in words; ``of``: subset of the states, or for any sensor nothing."""
+    passing = [
+        not any(f.rejected for f in outcome.judgement.findings if f.name == statistic and of in ("", f.of))
+        for outcome in outcomes
+    ]
+    return f"{sum(passing)} of {len(outcomes)} pass"
 
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:

@@ -29,8 +29,15 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     *own_tables, drift_table, filter_table = coning_study.tables(study)
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
-    passing = [row["integration"] for row in filters if row["consistent"]]
-    answer = "consistent" if len(passing) == len(filters) else "not consistent"
+    verdicts = {row["verdict"] for row in filters}
+    answer = (
+        next(iter(verdicts))
+        if len(verdicts) == 1
+        else "not consistent"
+        if "not consistent" in verdicts
+        else "cannot tell"
+    )
+    passing = [row["integration"] for row in filters if row["verdict"] == "consistent"]
     reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter: {', '.join(passing) or 'none'}"
     content = page.page(
         "Coning study",
