@@ -113,7 +113,7 @@ def effective_samples(white: ArrayLike, first: int | None = None, *, of_mean: bo
     """Return the number of independent samples with the same variance of the mean of |z|² of the first components of the series (m, n).
 
     ``m/(1 + 2 Σ_τ (1 − τ/m) ‖(A^τ)_first‖²/first)``, A by least squares; ``of_mean``: of the mean of z, with the trace of A^τ in place of
-    the squared norm.
+    the squared norm. It is at most m: a negative sum, of errors that alternate, is not counted, which leaves σ too large.
     """
     z = array("white", white, ("m", "n"))
     m, n = z.shape
