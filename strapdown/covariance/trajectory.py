@@ -89,13 +89,6 @@ class Trajectory(NamedTuple):
         return out
 
 
-def _exact(sensor: Any) -> Any:
-    """Return the sensor without noise."""
-    zero = {name: 0.0 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
-    faults = dataclasses.replace(sensor.faults, correlated_sigma=0.0, outlier_probability=0.0)
-    return dataclasses.replace(sensor, **zero, faults=faults)
-
-
 def _observed(scenario: Scenario) -> list[VectorMeasurements]:
     """Return the measurements of each sensor without noise, with the σ of the sensor."""
     start, end = scenario.edges[0], scenario.edges[-1]
@@ -116,7 +109,7 @@ def _observed(scenario: Scenario) -> list[VectorMeasurements]:
         # The same seed for both, so that the same samples are lost.
         own, exact = (
             source.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name))
-            for source in (sensor, _exact(sensor))
+            for source in (sensor, vectors.without_noise(sensor))
         )
         observed.append(
             dataclasses.replace(own, vector_b=exact.vector_b, attitude=exact.attitude, reference_f=exact.reference_f)

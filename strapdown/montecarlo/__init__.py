@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 from strapdown.estimation.setup import FilterSetup as FilterSetup
 from strapdown.montecarlo.engine import choose as choose
-from strapdown.montecarlo.engine import in_threads as in_threads
 from strapdown.montecarlo.engine import replay, run, run_plan
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.plan import from_table as from_table

@@ -305,17 +305,10 @@ def _gyro_terms(plan: Plan, record: ImuRecord, limit: float, turns: Array) -> mo
 
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
     """Return noise-free values of a sensor (m, 4), its true σ (m, 3) and the scale of its noise (m,), as the filter takes them."""
-    silent = replace(sensor.faults, outlier_probability=0.0, correlated_sigma=0.0)
-    changes: dict[str, Any] = {"faults": silent}
-    if isinstance(sensor, AttitudeSensor):
-        changes.update(sigma_across=0.0, sigma_about=0.0)
-    else:
-        changes.update(sigma=0.0)
-        if isinstance(sensor, Magnetometer | Accelerometer):
-            changes.update(kind="vector")
-    exact = replace(sensor, **changes).observe(
-        scenario.motion, scenario.edges[0], scenario.edges[-1], generator(0, 0, sensor.name)
-    )
+    silent = vectors.without_noise(sensor)
+    if isinstance(sensor, Magnetometer | Accelerometer):
+        silent = replace(silent, kind="vector")
+    exact = silent.observe(scenario.motion, scenario.edges[0], scenario.edges[-1], generator(0, 0, sensor.name))
     m = len(series.time)
     if series.attitude is not None:
         assert exact.attitude is not None

@@ -177,6 +177,13 @@ class Sampled(ByValue):
         raise NotImplementedError
 
 
+def without_noise(sensor: Any) -> Any:
+    """Return a sensor without white and correlated noise and outliers."""
+    zero = {name: 0.0 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
+    faults = dataclasses.replace(sensor.faults, correlated_sigma=0.0, outlier_probability=0.0)
+    return dataclasses.replace(sensor, **zero, faults=faults)
+
+
 def unit_vector(vector: Array) -> Array:
     """Return vectors (..., 3) divided by their lengths."""
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
