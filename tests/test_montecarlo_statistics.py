@@ -237,6 +237,10 @@ def test_bounds_are_those_that_decide():
     judgement = sums.judge(epochs=epochs, confidence_level=0.95)
     assert montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)["judgement"] == judgement.summary()
     bounds = {(finding.name, finding.of): (finding.low, finding.high) for finding in judgement.findings}
+    anees = sums.anees[epochs, 2]
+    worst = sums.time[epochs[np.abs(np.log(anees)).argmax()]]
+    (at,) = (finding.at for finding in judgement.findings if (finding.name, finding.of) == ("ANEES", "bias"))
+    assert at == f"mean {anees.mean():.4g}, worst at {worst:g} s"
     assert len(judgement.findings) == 10
     assert not any(finding.rejected for finding in judgement.findings)
     single = 0.05 / 10.0
@@ -522,8 +526,10 @@ def test_chunks_that_finish_out_of_order_are_merged_in_order():
             last.set() if first_run == 25 else last.wait(60.0)
             return result
 
-    work = LastFirst(plans=(PLAN,), machine="scalar")
+    work, threads = LastFirst(plans=(PLAN,), machine="scalar"), threading.active_count()
     parts = [part for (part,) in engine.in_threads(6)(work, engine.chunks_of(30, 5))]
+    time.sleep(0.1)
+    assert threading.active_count() <= threads
     assert not different(sums, functools.reduce(montecarlo.merge, parts))
 
 
