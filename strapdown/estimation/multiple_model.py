@@ -139,7 +139,10 @@ def run(
     bank = replace(joined(estimates), skipped=skipped, events=forward.in_order(forward.gaps(record)))
     whole, now = bank, float(bank.time[-1])
     if merged and now < record.time[-1]:
-        after = _as_one(rest, process_noise, bank, every)
+        assert bank.covariance is not None
+        state = State(attitude=bank.attitude[-1], bias=bank.bias[-1], covariance=bank.covariance[-1])
+        part = _after(rest, now, len(rest.vectors))
+        after = estimation.run(part, process_noise, state, every=every, full_covariance=True)
         whole = joined([bank, replace(after, events=())])  # gaps are already included
     return BankEstimate(
         estimate=whole,
@@ -171,9 +174,7 @@ def start(events: Schedule, event: int, initial: State, hypotheses: int) -> list
     Gaussians is uniform over the circle to 1.5 %. A measured attitude gives a single hypothesis.
     """
     z, frame = events.vector_b[event], events.triads[events.reference[event]]
-    noise = np.zeros((3, 3))
-    noise[np.triu_indices(3)] = events.body_noise[event]
-    noise = np.triu(noise) + np.triu(noise, 1).T
+    noise = events.body_noise[event][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     if events.kind[event] == measurement.ATTITUDE:
         attitudes = frame[None, :4]
     else:
@@ -190,7 +191,7 @@ def start(events: Schedule, event: int, initial: State, hypotheses: int) -> list
 
 
 def _after(record: ImuRecord, began: float, sensor: int) -> ImuRecord:
-    """Return the record from a measurement of a sensor on, without it and those processed before it."""
+    """Return the record from a time on, without the measurements before it and those of sensors up to this one at it."""
     k = int(np.searchsorted(record.time, began, side="right"))
     increments = record.increments[k - 1 :].copy()
     increments[0] *= (record.time[k] - began) / (record.time[k] - record.time[k - 1])
@@ -278,17 +279,6 @@ def mixture(bank: list[Estimate], rows: np.ndarray, weights: Array) -> tuple[Arr
 def share(P: Array, between: Array, block: slice) -> Array:
     """Return tr(P⁻¹ S) of a block of three states (rows,): the fraction of P due to differences, summed over the axes."""
     return np.asarray(np.trace(np.linalg.solve(P[:, block, block], between[:, block, block]), axis1=1, axis2=2))
-
-
-def _as_one(rest: ImuRecord, process_noise: ProcessNoise, merged: Estimate, every: int) -> Estimate:
-    """Return the plain filter's estimate from the last row of the mixture on."""
-    assert merged.covariance is not None
-    state = State(attitude=merged.attitude[-1], bias=merged.bias[-1], covariance=merged.covariance[-1])
-    now = merged.time[-1]
-    part = records.cut(rest, int(np.searchsorted(rest.time, now)), len(rest.increments))
-    # `cut` assigns the measurements at the first edge of all to the part that begins there; the bank has processed them.
-    part = replace(part, vectors=tuple(series.taken(series.time > now) for series in part.vectors))
-    return estimation.run(part, process_noise, state, every=every, full_covariance=True)
 
 
 def _reason(events: Schedule, left: int, estimate: Estimate) -> str:
