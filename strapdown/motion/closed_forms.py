@@ -99,6 +99,12 @@ class _Cone:
         across = self.precession_rate * math.sin(self.angle)
         return stacked(across * sine, across * cosine, self._rate_along)
 
+    def body_angular_acceleration(self, time: ArrayLike) -> Array:
+        """Return dw_b/dt = Ω_p Ω_s sinβ (cos Ω_s t, −sin Ω_s t, 0), rad/s²."""
+        cosine, sine = cosine_sine((self.spin_rate, 0.0), times(time))
+        across = self.precession_rate * self.spin_rate * math.sin(self.angle)
+        return stacked(across * cosine, -across * sine, 0.0)
+
     def increments(self, edges: ArrayLike) -> Array:
         """Return ∫ w_b dt over each interval, rad."""
         stamps = edge_stamps(edges)
@@ -156,12 +162,6 @@ class Coning(_Cone):
         half = math.sin(0.5 * self.angle)
         return stacked(math.cos(0.5 * self.angle), half * cosine, half * sine, 0.0)
 
-    def body_angular_acceleration(self, time: ArrayLike) -> Array:
-        """Return dw_b/dt = −ω² sinβ (cos ωt, sin ωt, 0), rad/s²."""
-        cosine, sine = cosine_sine((self.rate, 0.0), times(time))
-        across = self.rate**2 * math.sin(self.angle)
-        return stacked(-across * cosine, -across * sine, 0.0)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SpinCone(_Cone):
@@ -197,12 +197,6 @@ class SpinCone(_Cone):
         return stacked(
             c * (pc * sc - ps * ss), s * (pc * sc + ps * ss), s * (ps * sc - pc * ss), c * (ps * sc + pc * ss)
         )
-
-    def body_angular_acceleration(self, time: ArrayLike) -> Array:
-        """Return dw_b/dt, rad/s²."""
-        cosine, sine = cosine_sine((self.spin_rate, 0.0), times(time))
-        across = self.precession_rate * self.spin_rate * math.sin(self.angle)
-        return stacked(across * cosine, -across * sine, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
