@@ -369,7 +369,9 @@ def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array,
 def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
     """Return the errors of each filter on recordings with a reference, with its gain chosen on the others."""
     begun = [int(np.searchsorted(recording.time, ahrs.estimate(recording).recording.time[0])) for recording in read]
-    whole = [recording.since(first) for recording, first in zip(read, begun, strict=True)]  # with the package's start
+    whole = [
+        recording.taken(slice(first, None)) for recording, first in zip(read, begun, strict=True)
+    ]  # with the package's start
     short = [_until(recording, float(recording.time[np.argmax(recording.movement)]) + SEARCHED) for recording in whole]
     candidates: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
         "strapdown estimate": ours,
@@ -409,9 +411,7 @@ def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | N
 
 
 def _until(recording: Recording, end: float) -> Recording:
-    rows = slice(0, int(np.searchsorted(recording.time, end)))
-    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
-    return replace(recording, **{name: getattr(recording, name)[rows] for name in names})
+    return recording.taken(recording.time < end)
 
 
 def _errors(

@@ -167,8 +167,7 @@ def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
     estimate = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (COLOURED,))
     used = plain.recording
     rows = np.searchsorted(used.time, plain.record.time)
-    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
-    return replace(used, **{name: getattr(used, name)[rows] for name in names}), estimate.attitude
+    return used.taken(rows), estimate.attitude
 
 
 def gyro_latency(recording: Recording) -> tuple[float, float]:
@@ -231,10 +230,10 @@ def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
         ironed = replace(recording, magnetic_field=field + iron)
     return {
         f"clipped at {limit / DEGREE:.0f} °/s": replace(recording, rate=clipped),
-        "three dropouts of 0.3 s": _rows(recording, kept),
-        "a fifth of the rows lost": _rows(recording, random.random(n) > 0.2),
+        "three dropouts of 0.3 s": recording.taken(kept),
+        "a fifth of the rows lost": recording.taken(random.random(n) > 0.2),
         "no magnetometer": replace(recording, magnetic_field=None),
-        "no rest": _rows(recording, np.arange(n)[begin : moving[-1]]),
+        "no rest": recording.taken(np.arange(n)[begin : moving[-1]]),
         "4 % of hard iron": ironed,
         "4 % of hard iron, no states for it": ironed,
         "repeated stamps": _stamped_again(recording, np.unique(random.integers(1, n, n // 300))),
@@ -248,13 +247,6 @@ def _stamped_again(recording: Recording, rows: np.ndarray) -> Recording:
     names = ("specific_force", "magnetic_field", "true_attitude", "movement")
     columns = {name: getattr(recording, name) for name in names}
     return with_gyro(source=recording.source, time=time, rate=recording.rate, **columns)
-
-
-def _rows(recording: Recording, rows: np.ndarray) -> Recording:
-    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
-    return replace(
-        recording, **{n: None if getattr(recording, n) is None else getattr(recording, n)[rows] for n in names}
-    )
 
 
 def scored(result: AhrsEstimate, taken: float) -> Score:
@@ -365,7 +357,7 @@ def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Sco
         results.append(result)
     # All filters start at the same time as ours.
     begin = int(np.searchsorted(recording.time, results[0].recording.time[0]))
-    used = (recording if latency is None else shifted(recording, latency)).since(begin)
+    used = (recording if latency is None else shifted(recording, latency)).taken(slice(begin, None))
     for name, (attitude, taken) in peers(used).items():
         errors = reference_errors(attitude, used.true_attitude).rms(used.movement)  # type: ignore[arg-type]
         scores[name] = Score(errors=tuple(errors[part] for part in PARTS), time=taken / len(used.time))

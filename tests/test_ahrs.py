@@ -80,12 +80,6 @@ def worst(result: ahrs.AhrsEstimate, after: float = 0.0) -> dict[str, float]:
     return {name: getattr(errors, name)[late].max() / DEGREE for name in ("total", "heading", "inclination")}
 
 
-def rows_of(recording: Recording, rows: slice | np.ndarray) -> Recording:
-    """Some of the samples of a recording."""
-    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude")
-    return dataclasses.replace(recording, **{name: getattr(recording, name)[rows] for name in names})
-
-
 MOTIONS = [pytest.param(name, marks=pytest.mark.slow if name == "vessel" else []) for name in ahrs.MOTIONS]
 """The filter of a vessel takes 12 s to compile."""
 
@@ -174,7 +168,7 @@ def test_missing_samples_are_skipped_and_counted():
 def test_half_the_rate_gives_the_same_within_the_trapezoid_rule(parameters):
     """The weight of a second of measurements does not depend on the recording's rate."""
     plain = recording(60.0, bias=(0.005, 0.0, 0.0), noise=0.0)
-    half = rows_of(plain, slice(None, None, 2))
+    half = plain.taken(slice(None, None, 2))
     whole, sparse = (ahrs.estimate(samples, parameters, latency=0.0).estimate for samples in (plain, half))
     # Spans at rest end a sample apart, and the bias is measured there.
     later = slice(120, None)
@@ -273,7 +267,7 @@ def in_a_hurry(duration, lever_arm=0.0, seed=3):
 
 def test_after_a_dropout_the_field_before_it_is_forgotten():
     whole = in_a_hurry(30.0)
-    part = rows_of(whole, (whole.time < 120.0) | (whole.time > 120.5))
+    part = whole.taken((whole.time < 120.0) | (whole.time > 120.5))
     error = quaternion.angle_between(ahrs.estimate(part, latency=0.0).estimate.attitude, part.true_attitude) / DEGREE
     lost, recovered = (part.time > 120.0) & (part.time < 120.6), part.time > 122.5
     assert error[lost].max() > 35.0  # the rotation over the dropout is unknown
@@ -282,7 +276,7 @@ def test_after_a_dropout_the_field_before_it_is_forgotten():
 
 def test_the_smoother_recovers_the_attitude_of_a_start_in_motion(monkeypatch):
     whole = in_a_hurry(30.0, lever_arm=0.4)
-    part = rows_of(whole, whole.time > 112.3)
+    part = whole.taken(whole.time > 112.3)
     largest = []
     for starts in (estimating.MAX_STARTS, 1):
         monkeypatch.setattr(estimating, "MAX_STARTS", starts)
@@ -331,7 +325,7 @@ def test_start_is_triad_of_the_first_sample():
 
 
 def test_the_first_valid_samples_are_turned_back_to_the_first_stamp():
-    moving = recording().since(600)
+    moving = recording().taken(slice(600, None))
     late = {}
     for name, missing in (("specific_force", 20), ("magnetic_field", 50)):
         late[name] = getattr(moving, name).copy()
@@ -374,7 +368,7 @@ def test_quiet_span_is_the_first_quiet_second():
 def test_every_sample_has_an_attitude_wherever_the_rest_is(smooth):
     """A recording that begins in motion, with a gyro bias, and rests at its end: smoothed, the rest serves all of it."""
     bias = np.array([3.0, -2.0, 1.5]) * DEGREE
-    moving = recording(40.0, bias=tuple(bias), noise=0.3).since(800)
+    moving = recording(40.0, bias=tuple(bias), noise=0.3).taken(slice(800, None))
     n = round(3.0 * RATE)
     random = np.random.default_rng(12)
     last = {
@@ -760,7 +754,7 @@ def test_the_filter_is_causal(latency):
     """What comes later changes nothing of what was said before, delays that are found included."""
     whole = late(gyro=0.004, field=0.015)
     rows = round(20.0 * RATE)
-    first, both = (ahrs.estimate(samples, latency=latency) for samples in (rows_of(whole, slice(rows)), whole))
+    first, both = (ahrs.estimate(samples, latency=latency) for samples in (whole.taken(slice(rows)), whole))
     assert both.delays.last_field == pytest.approx(0.015, abs=1e-3)
     before = slice(0, rows - 100)  # the last step and heading interval end with the record
     np.testing.assert_allclose(both.estimate.attitude[before], first.estimate.attitude[before], atol=1e-12)

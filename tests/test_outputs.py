@@ -150,7 +150,7 @@ def test_a_table_says_all_in_its_names(case):
     assert "angle_1_z_deg" in ned
     np.testing.assert_array_equal(ned["heading_deg"], table["heading_deg"])
     with pytest.raises(InputError, match=r"walk has no stamp 0.1 s"):
-        estimate.table(recording=recording.since(20))
+        estimate.table(recording=recording.taken(slice(20, None)))
 
 
 def test_an_estimate_has_methods_for_all_of_it(case):

@@ -285,7 +285,7 @@ def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     np.testing.assert_allclose(recording.specific_force[:, 0], [1, 2, 5, 6, 7])
     np.testing.assert_array_equal(recording.missing_gyro, [0.0, 0.03, 0.04])
     for first in (0, 1):
-        np.testing.assert_array_equal(recording.since(first).missing_gyro, [0.03, 0.04])
+        np.testing.assert_array_equal(recording.taken(slice(first, None)).missing_gyro, [0.03, 0.04])
     # The trapezoid over the joined interval; of a rate that changes evenly it is right.
     np.testing.assert_allclose(recordings.increments(recording)[1, 0], 0.5 * (0.2 + 0.5) * 0.03, rtol=1e-14)
     assert recording.left_out_words.startswith("3 rows without a gyro sample, the first at 0.000 s, were left out")
@@ -307,7 +307,7 @@ def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     np.testing.assert_array_equal(twice.rate, once.rate)
     np.testing.assert_array_equal(twice.specific_force, once.specific_force)
     np.testing.assert_array_equal(twice.repeated, [0.02, 0.02, 0.05])
-    np.testing.assert_array_equal(twice.since(3).repeated, [0.05])
+    np.testing.assert_array_equal(twice.taken(slice(3, None)).repeated, [0.05])
     assert twice.left_out_words == "3 rows that repeat the row before, the first at 0.020 s, were left out."
     assert once.left_out_words == ""
     missing = rows[2].replace("0.2,0,0", ",0,0")
@@ -463,7 +463,7 @@ def test_broad_trial(broad):
 # ---------------------------------------------------------------------------------------------------- the recording
 
 
-def test_since():
+def test_taken():
     recording = Recording(
         source="x",
         time=np.arange(5.0),
@@ -472,7 +472,7 @@ def test_since():
         temperature=[20, 21, 22, 23, 24],
         movement=np.array([0, 0, 1, 1, 1], bool),
     )
-    later = recording.since(2)
+    later = recording.taken(slice(2, None))
     np.testing.assert_array_equal(later.temperature / 2.0, [11.0, 11.5, 12.0])
     np.testing.assert_array_equal(later.time, [2.0, 3.0, 4.0])
     np.testing.assert_array_equal(later.rate, recording.rate[2:])

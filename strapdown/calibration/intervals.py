@@ -118,20 +118,8 @@ def _parts(recording: Recording) -> list[Recording]:
         raise InputError(f"{recording.source} has no accelerometer; a calibration needs it: add columns ax, ay, az")
     steps = np.diff(recording.time)
     bounds = [0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1), len(recording.time)]
-    parts = [_rows(recording, slice(a, b)) for a, b in itertools.pairwise(bounds) if b - a > 2]
+    parts = [recording.taken(slice(a, b)) for a, b in itertools.pairwise(bounds) if b - a > 2]
     return [part for part in parts if part.time[-1] - part.time[0] >= SHORTEST and part.specific_force is not None]
-
-
-def _rows(recording: Recording, rows: slice) -> Recording:
-    """Return the samples of some rows of a recording."""
-    force, field = recording.specific_force, recording.magnetic_field
-    return Recording(
-        source=recording.source,
-        time=recording.time[rows],
-        rate=recording.rate[rows],
-        specific_force=None if force is None else force[rows],
-        magnetic_field=None if field is None else field[rows],
-    )
 
 
 def _edges(time: Array) -> np.ndarray:

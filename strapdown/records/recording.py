@@ -155,25 +155,24 @@ class Recording(Listed):
         steps = np.sort(np.diff(self.time))  # of nearly equal numbers, to select one takes seven times as long
         return float(0.5 * (steps[(len(steps) - 1) // 2] + steps[len(steps) // 2]))
 
-    def since(self, first: int) -> Recording:
-        """Return the recording from a given sample on.
+    def taken(self, which: Any) -> Recording:
+        """Return the samples that an index selects, such as ``slice(first, None)``.
 
         Parameters
         ----------
-        first : int
-            Index of the first sample kept.
+        which : ndarray or slice
+            Mask (n,), slice or array of indices, of at least two samples in order of time.
 
         Returns
         -------
         Recording
-            The rest of the recording.
+            The selected samples.
         """
-        if first == 0 and not len(self.missing_gyro) and not len(self.repeated):
-            return self
-        rows = slice(first, None)
-        parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
-        begin = parts["time"][0]
-        missing, repeated = (stamps[stamps > begin] for stamps in (self.missing_gyro, self.repeated))
+        parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[which] for n in _ROWS}
+        begin, end = parts["time"][[0, -1]]
+        missing, repeated = (
+            stamps[(begin < stamps) & (stamps <= end)] for stamps in (self.missing_gyro, self.repeated)
+        )
         return replace(self, missing_gyro=missing, repeated=repeated, **parts)
 
     def rows_of(self, time: Array) -> NDArray[np.int64]:
