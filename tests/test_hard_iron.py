@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from strapdown.kernels import headings
 from strapdown.recordings import hard_iron
 
 FIELD = np.array([0.0, 18.0, -40.0])
@@ -27,7 +28,15 @@ def turned(iron, duration: float = 60.0, size: float = 1.0, noise: float = 0.2, 
 
 def iron_of(field, frame, time, causal=True, known=None):
     known = np.ones(len(time), bool) if known is None else known
-    return hard_iron.find(field, frame, time, known, STRENGTH, causal=causal)
+    if not causal:
+        return hard_iron.find(field, frame, time, known, STRENGTH)
+    others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
+    constants = headings.Constants(**others | hard_iron.parts(STEP))
+    memory, result = hard_iron.memory(constants.lag, 1), np.empty((len(time), 3))
+    for k in range(len(time)):
+        result[k] = headings.iron_step(constants, field[k], frame[k], known[k], time[k], STRENGTH, memory)
+        memory.counted[1] += 1
+    return result
 
 
 @pytest.mark.parametrize("causal", [True, False])

@@ -123,7 +123,7 @@ def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
     vertical = _vertical(steps.force, interval)
     as_measured = _look(field, vertical, parameters, interval)
     measured = as_measured
-    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(measured.usual[0, 0]), causal=False)
+    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(measured.usual[0, 0]))
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
         without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval)

@@ -139,16 +139,6 @@ def heading_steps(constants, steps, memory, out):
         heading_step(constants, steps, memory, out, k)
 
 
-def iron_steps(constants, field, frame, known, time, strength, memory, iron):
-    """Write the iron (k, 3) of each row from fields (k, 3) in the frame fixed by the gyro, and attitudes (k, 4)."""
-    for k in range(len(time)):
-        corrected = iron_step(
-            constants, vector_at(field, k), quaternion_at(frame, k), known[k], time[k], strength, memory
-        )
-        memory.counted[1] += 1
-        store_row(iron, k, corrected)
-
-
 def equations_until(constants, field, frame, known, time, strength, k):
     """Return the equations by the change of the field over ``lag`` rows up to row k; zeros without such a change."""
     then = k - constants.lag
@@ -170,7 +160,10 @@ def added(rows, k, values):
 
 
 def iron_of_all(constants, field, frame, known, time, strength, before, iron):
-    """Write the iron (k, 3) as :func:`iron_steps`, by the changes before and after each row; ``before`` (k, 9) is scratch."""
+    """Write the iron (k, 3) by the changes before and after each row; ``before`` (k, 9) is scratch.
+
+    ``field`` (k, 3) is in the frame fixed by the gyro, ``frame`` (k, 4) the attitude by it.
+    """
     sums = NO_EQUATIONS
     for k in range(len(time)):
         equations = equations_until(constants, field, frame, known, time, strength, k)

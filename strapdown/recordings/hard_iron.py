@@ -31,20 +31,17 @@ FEIGNED = 0.028
 """Apparent iron of a field that varies along the path, relative to its magnitude: estimates are multiplied by 1 − (apparent/estimate)²."""
 
 
-def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float, *, causal: bool) -> Array:
-    """Return the hard iron at each row (k, 3), in the unit of the field and body axes.
+def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float) -> Array:
+    """Return the hard iron at each row (k, 3), in the unit of the field and body axes, from the rows before and after it.
 
     ``field`` (k, 3) is in the frame fixed by the integrated gyro, ``frame`` (k, 4) the attitude by the gyro, ``time`` (k,), s, with nearly
-    equal intervals, ``known`` (k,) the rows with a field. ``causal``: only rows up to each are used; otherwise those after it too.
+    equal intervals, ``known`` (k,) the rows with a field. Online, the iron is part of :func:`strapdown.kernels.headings.heading_steps`.
     """
     interval = float(np.median(np.diff(time)))
     others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
     constants, result = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
     rows = (read_only(column) for column in (field, frame, known, time))
-    if causal:
-        compiled(headings.iron_steps)(constants, *rows, strength, memory(constants.lag, 1), result)
-    else:
-        compiled(headings.iron_of_all)(constants, *rows, strength, np.empty((len(time), 9)), result)
+    compiled(headings.iron_of_all)(constants, *rows, strength, np.empty((len(time), 9)), result)
     return result
 
 
