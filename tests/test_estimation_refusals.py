@@ -12,7 +12,6 @@ from strapdown.estimation import LiveFilter, error_states, filters, multiple_mod
 from strapdown.estimation.error_states import BoundedVelocity, GaussMarkov, GyroForce, GyroScale, LeverArm, VectorBias
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.model import assemble
-from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup import FilterSetup, states
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise, initial_state
@@ -204,7 +203,6 @@ TABLE = [
     (lambda: run().errors(np.zeros(4), np.zeros(3), {"x": 1.0}), {}, "true_values"),
     (lambda: estimation.observability(RECORD, NOISE, start(), threshold=0.0), {}, "threshold is 0"),
     (lambda: estimation.with_error_states(start(), MAG_BIAS), {}, "give a tuple"),
-    (lambda: schedule((replace(SERIES, sigma=0.0, sigma_axes=[1, 0, 1]),), 0.0, 1.0), {}, "one sigma per sample"),
     (lambda: replace(RECORD, vectors=SERIES), {}, "(series,)"),
     (lambda: resting(X), {}, "vectors[0] is"),
     (lambda: records.compress(RECORD, "two-samples"), {}, "'two-sample'"),

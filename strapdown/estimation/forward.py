@@ -244,7 +244,7 @@ def prepared(
     if not driven:
         temperature.need_none(declared, "this estimator")
     state = modelling.begin(initial, declared)
-    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
+    events = schedule(record.vectors, record.time[0], record.time[-1])
     kinds = dict(zip(events.sensors, events.kinds, strict=True))
     model = modelling.assemble(declared, kinds, isotropic=events.noise is None)
     return Problem(

@@ -127,19 +127,8 @@ class Schedule:
         return rows
 
 
-def schedule(
-    vectors: tuple[VectorMeasurements, ...], start: float, end: float, *, anisotropic: bool = False
-) -> Schedule:
-    """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped.
-
-    ``anisotropic``: whether the caller uses the ``noise`` of measurements; otherwise a series with more than one σ per sample (for an
-    attitude one per axis) is refused.
-    """
-    for series in vectors:
-        if series.anisotropic and not anisotropic:
-            raise InputError(
-                f"{series.sensor}: this filter needs one sigma per sample, not sigma_axes or covariance; use estimation.run, or give sigma"
-            )
+def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) -> Schedule:
+    """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped."""
     parts = [_scheduled(series, start, end) for series in vectors]
     bounds = np.array([0, *accumulate(len(part.time) for part in parts)])
     first_frames = [0, *accumulate(len(part.frames) for part in parts)]

@@ -159,7 +159,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if self.sensors:
             one_of("sensor", series.sensor, self.sensors)
         sample = series.taken([k])
-        events = schedule((sample,), -np.inf, np.inf, anisotropic=True)
+        events = schedule((sample,), -np.inf, np.inf)
         z = tuple(events.vector_b[0].tolist()) if len(events.time) and series.kind != "attitude" else (0.0, 0.0, 0.0)
         vertical = series.kind == "heading" and not has_heading(rotation_matrix(tuple(self.attitude.tolist())), z)
         if not len(events.time) or vertical:

@@ -134,7 +134,7 @@ def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array
     levers = any(np.any(sensor.lever_arm_sigma) for sensor in states.sensors.values())
     if not levers or np.any(states.gyro_temperature_sigma):
         return None
-    return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
+    return turning(record, schedule(record.vectors, record.time[0], record.time[-1]).time)
 
 
 def _run_own(own: Own, record: ImuRecord, initial: State, *, every: int = 1, full_covariance: bool = False) -> Estimate:
