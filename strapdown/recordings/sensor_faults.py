@@ -104,11 +104,8 @@ def find(recording: Recording) -> Faults:
     if filled:
         lengths = np.array([recording.time[last] - recording.time[first] for first, last in filled])
         turns = np.minimum(turn_variance_over(rate, lengths, usual), UNKNOWN_TURN)
-        for (first, last), turn in zip(filled, turns, strict=True):
-            # σ grows at nine times and not at each sample, because the filter starts anew at each.
-            variance[np.linspace(first, last, MIN_STRAIGHT - 1, endpoint=False).astype(int)] += turn / (
-                MIN_STRAIGHT - 1
-            )
+        for (first, _), turn in zip(filled, turns, strict=True):
+            variance[first] += turn
         inside = np.concatenate([np.arange(first + 1, last) for first, last in filled])
         for name in ("specific_force", "magnetic_field"):
             samples = changes.get(name, getattr(recording, name))
