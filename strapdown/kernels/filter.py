@@ -34,7 +34,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.chains import chain_start, chain_step
-from strapdown.kernels.filter_step import chosen_parts, process_noise, transition
+from strapdown.kernels.filter_step import process_noise, transition, turned_by
 from strapdown.kernels.gate_rules import (
     FIRST_BIAS,
     count_widening,
@@ -57,7 +57,7 @@ from strapdown.kernels.measurement import (
     six_at,
     value_of,
 )
-from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import SQUARED_RANGE
 from strapdown.kernels.structure import MAX_PRECISION, SIX_STATES, Effects, Gains, Measured, Progress, Structure
 from strapdown.kernels.walk import step_within, turn_squared
@@ -389,11 +389,14 @@ def gyro_effects(x, delta, dt, model, coefficients, like):
     return matrix_times_vector(D, r), D, force
 
 
-def gyro_columns(phi, D, force, dt, phi12, model, like):
-    """Return the effects of the states that enter the gyro: on the rate, for those that are constant over a step, and on the attitude.
+def transition_parts(phi, D, force, dt, model):
+    """Return Φ11, Φ12 and the effects of the states that enter the gyro: on the rate, if constant over a step, or on the attitude.
 
     The columns of Φ of the first are Φ12 times their effects.
     """
+    phi11, phi12 = transition(phi, dt)
+    if D is not None:
+        phi12 = multiply(phi12, D)
     numbers = model.numbers
     rate = scale(1.0 / dt, phi)
     effects, columns = [], []
@@ -415,7 +418,7 @@ def gyro_columns(phi, D, force, dt, phi12, model, like):
             effect = sum_of(effect, matrix_products(numbers_of(g.force, numbers), force))
         if any_number(effect):
             effects.append((g.state, effect))
-    return tuple(effects), tuple(columns)
+    return phi11, phi12, tuple(effects), tuple(columns)
 
 
 def driven_noise(q11, rate, D, dt, model, like):
@@ -507,11 +510,7 @@ def propagate_formula(x, P, gyro, noise, dt, model, coefficients, like):
     """Propagate state and covariance, given the effects of the gyro and the noise of the step."""
     (phi, D, force), (q11, q12, q22, cross_noise) = gyro, noise
     q = tuple_at(x, 0, 4, like)
-    c = tuple_at(x, 7, N - 6, like)
-    phi11, phi12 = transition(phi, dt)
-    if D is not None:
-        phi12 = multiply(phi12, D)
-    effects, columns = gyro_columns(phi, D, force, dt, phi12, model, like)
+    phi11, phi12, effects, columns = transition_parts(phi, D, force, dt, model)
     for i, y in enumerate(turned(q, phi)):
         put_at(x, i, y)
     top = tuple(kept(row, P, W * a) for a, row in enumerate(top_rows(P, phi11, phi12, effects, columns, like)))
@@ -531,16 +530,15 @@ def propagate_formula(x, P, gyro, noise, dt, model, coefficients, like):
                     put_at(P, place(j, a), t[j])  # of one run, the row is written already
     for j in (3, 4, 5):
         put_element(P, j, j, plus(element_at(P, j, j, like), q22))
-    predict_chains(x, P, top, c, noise is not NO_NOISE, cross_noise, coefficients, like)
+    apply_chains(x, 1, coefficients, like)
+    predict_chains(P, top, noise is not NO_NOISE, cross_noise, coefficients, like)
 
 
-def predict_chains(x, P, top, c, noisy, cross_noise, coefficients, like):
-    """Propagate the states that decay or are driven; ``top``: rows of the attitude after the step, with these states before it."""
+def predict_chains(P, top, noisy, cross_noise, coefficients, like):
+    """Propagate the covariance of the states that decay or are driven; ``top``: rows of the attitude, with these states before the step."""
     half = {}
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
-        for k, row in zip(states, F, strict=True):
-            put_at(x, 1 + k, products(row, tuple(c[j - 6] for j in states)))
         for first in PARTS if LANES == 1 else OTHERS:
             old = tuple(part(P, k, first, like) for k in states)
             for k, row in zip(states, F, strict=True):
@@ -650,10 +648,7 @@ def scatter_noisy_columns(columns, block, P):
 def transition_formula(x, delta, dt, model, coefficients, top, like):
     """Write the rows of the attitude of Φ."""
     phi, D, force = gyro_effects(x, delta, dt, model, coefficients, like)
-    phi11, phi12 = transition(phi, dt)
-    if D is not None:
-        phi12 = multiply(phi12, D)
-    effects, columns = gyro_columns(phi, D, force, dt, phi12, model, like)
+    phi11, phi12, effects, columns = transition_parts(phi, D, force, dt, model)
     for a in AXES:
         for j in AXES:
             put_at(top, W * a + j, phi11[3 * a + j])
@@ -957,18 +952,6 @@ def independent(rows, y, axes, noise):
 # --------------------------------------------------------------------------------------------------------------------------- updates
 
 
-def turned_by(q, correction):
-    """Return q ⊗ exp(φ) and J_r(φ) of a correction of any size, one after the other."""
-    moved = turned(q, correction)
-    G = right_jacobian(correction)
-    large = dot(correction, correction) > SQUARED_RANGE
-    if any_lane(large):
-        far, J = far_turn(correction)
-        moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
-        G = chosen_parts(large, J, G)
-    return moved + G
-
-
 def measurement_of(s, body, measured, e):
     """Return the e-th measurement, by a sensor of shape s."""
     shape, at, sensor = STRUCTURE.sensors[s], measured.place[e], measured.sensor[e]
@@ -1101,7 +1084,7 @@ def judged(s, g, options):
     return select(g.valid, outcome, PASSED_OVER) if kind == HEADING else outcome
 
 
-def weighted(s, g, options, like):
+def weighted(g, options, like):
     """Return the robust weight of a measurement."""
     degrees = len(g.errors)
     S = innovation_covariance_of(g.shares, g.variances, g.noise, like)
@@ -1230,16 +1213,6 @@ def store_rows(s, x, work, measured, numbers, transverse, like):
     return angle, valid
 
 
-def row_place(i, j):
-    """Return the place of P[i, j], i ≤ j, of indices known at run time."""
-    return W * i + j if LANES == 1 else i * (2 * N - 1 - i) // 2 + j
-
-
-def row_place_below(i, j):
-    """Return the place of P[j, i], i ≤ j."""
-    return W * j + i if LANES == 1 else row_place(i, j)
-
-
 def product(P, work, row, line, like):
     """Write P h of a row of the work space to another line."""
     if LANES == 1:
@@ -1283,7 +1256,7 @@ def product_by_elements(P, work, row, line, like):
     for j in range(N):
         t = like
         for i in range(N):
-            t = t + value_at(work, row + i, like) * value_at(P, row_place(min(i, j), max(i, j)), like)
+            t = t + value_at(work, row + i, like) * element_at(P, i, j, like)
         put_at(work, line + j, t)
 
 
@@ -1292,9 +1265,7 @@ def minus_outer_by_elements(P, work, left, right, factor, like):
     for i in range(N):
         t = factor * value_at(work, left + i, like)
         for j in range(i, N):
-            s = value_at(P, row_place(i, j), like) - t * value_at(work, right + j, like)
-            put_at(P, row_place(i, j), s)
-            put_at(P, row_place_below(i, j), s)
+            put_element(P, i, j, element_at(P, i, j, like) - t * value_at(work, right + j, like))
 
 
 def take_row(P, work, line, residual, variance, like):
@@ -1412,7 +1383,7 @@ def outcome_{s}(g, options):
 
 
 def weight_{s}(g, options, like):
-    return weighted({s}, g, options, like)
+    return weighted(g, options, like)
 
 
 def judge_{s}(body, measured, e, options, like):
@@ -1489,12 +1460,12 @@ def longest_step(state, part, dt, body):
     return min(step_within(turn_squared(part, dt, bias_at(body, 0)), dt), body.model.limit)
 
 
-def propagate_row(body, i, part, dt):
+def propagate_row(body, i, part, dt, like):
     """Propagate state i."""
     if dt != body.dt[0]:
         fill_coefficients(body.coefficients, dt, body.model)
         body.dt[0] = dt
-    advance(body.x[i], body.P[i], part, dt, body.model, body.coefficients, 0.0)
+    advance(body.x[i], body.P[i], part, dt, body.model, body.coefficients, like)
 
 
 def predict(state, part, dt, body, out):
@@ -1503,7 +1474,7 @@ def predict(state, part, dt, body, out):
     if segments < len(out.segments):
         store_segment(out.segments, segments, dt, part, body.x[0], body.P[0])
         segments += 1
-    propagate_row(body, 0, part, dt)
+    propagate_row(body, 0, part, dt, 0.0)
     return Progress(segments, state.lost)
 
 
@@ -1846,11 +1817,9 @@ def double_step(coefficients, here):
 
 def age_chains(x, P, coefficients):
     """Apply the coefficients to the error states, which are independent of attitude and bias."""
+    apply_chains(x, 1, coefficients, 0.0)
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
-        values = tuple(x[1 + k] for k in states)
-        for k, row in zip(states, F, strict=True):
-            x[1 + k] = products(row, values)
         for j in OTHERS[3:]:
             old = tuple(P[W * k + j] for k in states)
             for k, row in zip(states, F, strict=True):

@@ -132,24 +132,27 @@ def update_row(b, A, B, C, h, innovation, variance):
     )
 
 
+def turned_by(q, correction):
+    """Return q ⊗ exp(φ) and J_r(φ) of a correction of any size, one after the other."""
+    moved = turned(q, correction)
+    G = right_jacobian(correction)
+    large = dot(correction, correction) > SQUARED_RANGE
+    if any_lane(large):
+        far, J = far_turn(correction)
+        moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
+        G = chosen_parts(large, J, G)
+    return moved + G
+
+
 def reset(q, A, B, correction):
     """Correct the attitude and transform the covariance to the new tangent space by G = J_r(correction).
 
     ``A ← G A Gᵀ``, ``B ← G B`` (conventions of :mod:`strapdown`; Markley & Crassidis 2014, section 6.2.1). Without this the filter is
     conservative or optimistic by second-order terms, and differs from the filter with the error in fixed axes.
     """
-    G = right_jacobian(correction)
-    moved = turned(q, correction)
-    large = dot(correction, correction) > SQUARED_RANGE
-    if any_lane(large):
-        far, J = far_turn(correction)
-        moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
-        G = chosen_parts(large, J, G)
-    return (
-        moved,
-        congruent(G, A),
-        multiply(G, B),
-    )
+    both = turned_by(q, correction)
+    moved, G = both[:4], both[4:]
+    return moved, congruent(G, A), multiply(G, B)
 
 
 def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, S):
@@ -189,16 +192,10 @@ def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):
 
 
 def update_direction(q, b, A, B, C, R, u, v, z, variance):
-    """Update with a unit direction, two degrees of freedom; return (q, b, A, B, C) and both innovations with their variances.
+    """Update with a unit direction, two degrees of freedom; return (q, b, A, B, C), both innovations with their variances, and the NIS.
 
     ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
     """
-    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
-    return q, b, A, B, C, e1, s1, e2, s2
-
-
-def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
-    """Return the results of :func:`update_direction` and the NIS; without the innovations, their divisions are saved."""
     h1, e1, h2, y2 = direction_rows(R, u, v, z)
     pa1 = symmetric_times_vector(A, h1)
     pa2 = symmetric_times_vector(A, h2)

@@ -164,7 +164,7 @@ def predict(state, part, dt, body, out):
         store_segment(out.form.segments, segments, dt, part, form.x[0], form.P[0])
         segments += 1
     for i in range(running):
-        propagate_row(form, i, part, dt)
+        propagate_row(form, i, part, dt, 0.0)
     return running, events, segments, lost
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from strapdown.kernels.filter import advance, element_at, fill_coefficients, put_element, take, whole_element
+from strapdown.kernels.filter import element_at, propagate_row, put_element, take, whole_element
 from strapdown.kernels.lane_values import WIDTH, load_like, store
 from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.state import store_several
@@ -31,11 +31,7 @@ def start_filters(q, b, body, like):
 
 def propagated(state, part, dt, body, like):
     """Propagate all runs."""
-    f = body.filters
-    if dt != f.dt[0]:
-        fill_coefficients(f.coefficients, dt, f.model)
-        f.dt[0] = dt
-    advance(f.x[0], f.P[0], part, dt, f.model, f.coefficients, like)
+    propagate_row(body.filters, 0, part, dt, like)
     return state
 
 

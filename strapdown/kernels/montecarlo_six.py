@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from strapdown.kernels.algebra import dot, matrix_times_vector, transpose_times_vector
-from strapdown.kernels.filter_step import predict, update_direction_and_judge, update_heading, update_residual
+from strapdown.kernels.filter_step import predict, update_direction, update_heading, update_residual
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
 from strapdown.kernels.lane_values import WIDTH, any_lane
 from strapdown.kernels.measurement import ATTITUDE, HEADING, KIND, VECTOR, frame_of, heading_row
@@ -67,9 +67,7 @@ def corrected(state, value, e, measured, body, like):
             q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
             nis = e1 * e1 / s1
         else:
-            q, b, A, B, C, e1, s1, e2, s2, nis = update_direction_and_judge(
-                q, b, A, B, C, R, frame[:3], frame[3:6], z, variance
-            )
+            q, b, A, B, C, e1, s1, e2, s2, nis = update_direction(q, b, A, B, C, R, frame[:3], frame[3:6], z, variance)
             if kind == VECTOR:
                 e3 = dot(transpose_times_vector(R, r), z) - 1.0
                 s3 = variance * ones

@@ -109,7 +109,7 @@ def update(state, e, now, measured, body, out):
             # The length has no information about the attitude but is part of the innovation.
             out.innovation[at, 4] = dot(transpose_times_vector(R, frame[6:]), z) - 1.0
             out.innovation[at, 5] = variance
-        q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, frame[:3], frame[3:6], z, variance)
+        q, b, A, B, C, e1, s1, e2, s2, _ = update_direction(q, b, A, B, C, R, frame[:3], frame[3:6], z, variance)
         sharp = max(s1, s2) > MAX_PRECISION * variance
     else:
         e1, s1, e2, s2 = math.nan, 0.0, 0.0, 1.0

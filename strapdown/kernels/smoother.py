@@ -194,8 +194,7 @@ def step_back(segments, k, models, space):
     load_segment(segments, k, x, P, width)
     dt = segments[k, 0]
     part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
-    for i in range(n + 1):
-        predicted[i] = x[i]
+    copy_state(x, predicted)
     fill_coefficients(coefficients, dt, models.forward)
     predict_state(predicted, part, dt, models.forward, coefficients, 0.0)
     relative_error(predicted, later_x, later_P, error)
