@@ -14,7 +14,6 @@ from typing import Any
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine
 from strapdown.kernels.algebra import dot, scale, square_root
-from strapdown.kernels.filter import ROWS_OF_KIND
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
 from strapdown.kernels.rotation import far_turn as far_turn_kernel
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
@@ -247,7 +246,7 @@ def correct(f: Any, sensor: Sensor, measured: Measured, g: Any) -> None:
         rows: dict[int, Any] = {}
         k.store_rows(sensor.shape, f.x, rows, measured, f.program.model.numbers, False, 0.0)
         k.clear_step(work, 0.0)
-        for i in range(ROWS_OF_KIND[sensor.kind]):
+        for i in range(degrees_of_freedom(sensor.kind)):
             line = k.LINE * (k.ROWS + i)
             for j in range(n):
                 work[k.LINE * k.ROWS + j] = rows[line + j]

@@ -53,6 +53,7 @@ from strapdown.kernels.measurement import (
     HEADING,
     VECTOR,
     VERTICAL,
+    degrees_of_freedom,
     frame_of,
     six_at,
     value_of,
@@ -982,11 +983,6 @@ def with_factors(shape, z, noise, f):
     return z, (noise[0] * f[0] * f[0],)
 
 
-def row_of_innovations(measured, e):
-    """Return the row for the innovations of a measurement; the first if another kernel takes them from there."""
-    return measured.place[e] if LANES == 1 else 0
-
-
 def measurement_in_lanes(s, body, measured, e, at, sensor):
     """Return the e-th measurement of several runs: ``value`` has four numbers of each run, a vector or an attitude."""
     shape, like = STRUCTURE.sensors[s], lanes_of((0.0,) * LANES)
@@ -1122,23 +1118,18 @@ def at_part(rows, c):
     return tuple(row[PARTS.index(c)] for row in rows if c in PARTS)
 
 
-def apply_gains(x, P, work, gain, step, like):
-    """Correct the state, update the covariance and transform it to the new tangent space, in one pass."""
-    correct_by(x, P, work, gain, kept(step, work, LINE * STEP), like)
-
-
 def fixed_turn(before, after):
     """Return the rotation from one attitude to another, as a matrix in fixed axes."""
     return rotation_matrix(quaternion_multiply(after, (before[0], -before[1], -before[2], -before[3])))
 
 
-def correct_by(x, P, work, gain, step, like):
+def apply_gains(x, P, work, gain, step, like):
     """Correct the state by a step; subtract Σ g gᵀ from the covariance, and transform it to the new tangent space, in one pass.
 
     A vector of carried states is defined in the axes of the *estimated* attitude: a correction that rotates the attitude by A in fixed axes
     changes it to A c, and its error likewise.
     """
-    before = tuple_at(x, 0, 4, like)
+    step, before = kept(step, work, LINE * STEP), tuple_at(x, 0, 4, like)
     both = turned_by(before, tuple(entry(step, work, LINE * STEP, a) for a in AXES))
     q, G = both[:4], both[4:]
     add_step(x, step, work, like)
@@ -1347,12 +1338,11 @@ def apply_step(x, P, work, like):
         load_like(work, LINE * STEP + c, lanes_of(EIGHT)) if LANES == 1 else value_at(work, LINE * STEP + c, like)
         for c in PARTS
     )
-    correct_by(x, P, work, (), step, like)
+    apply_gains(x, P, work, (), step, like)
 
 
 # --------------------------------------------------------------------------------------- updates by shape, which is known while compiling
 
-ROWS_OF_KIND = {DIRECTION: 2, VECTOR: 3, HEADING: 1, ATTITUDE: 3}
 _OF_A_SHAPE = """
 def gains_{s}(body, measured, e, factor, like):
     m = measurement_of({s}, body, measured, e)
@@ -1369,7 +1359,7 @@ def transverse_rows_{s}(x, body, measured, e, like):
 
 def take_{s}(body, measured, e, innovation, like):
     g = gains_{s}(body, measured, e, None, like)
-    store_innovations(innovation, row_of_innovations(measured, e), g.reported, g.variances)
+    store_innovations(innovation, {row}, g.reported, g.variances)
     {nis}
     if any_lane(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
@@ -1382,10 +1372,6 @@ def outcome_{s}(g, options):
     return judged({s}, g, options)
 
 
-def weight_{s}(g, options, like):
-    return weighted(g, options, like)
-
-
 def judge_{s}(body, measured, e, options, like):
     g = gains_{s}(body, measured, e, None, like)
     errors, variances = padded(g.reported, 0.0, like), padded(g.variances, 1.0, like)
@@ -1394,7 +1380,7 @@ def judge_{s}(body, measured, e, options, like):
     if outcome == ACCEPTED:
         weight = 1.0
         if options.robust > 0:
-            weight = weight_{s}(g, options, like)
+            weight = weighted(g, options, like)
             g = gains_{s}(body, measured, e, 1.0 / weight, like)
         if any_lane(g.precise):
             rows_{s}(body.x[0], body, measured, e, like)
@@ -1434,10 +1420,11 @@ _PRECISE = {
     True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
     False: "take_precisely_in_lanes(body, g.gain, g.step, g.precise, {rows}, like)",
 }[LANES == 1]
+_ROW = "measured.place[e]" if LANES == 1 else "0"  # the first row if another kernel takes the innovations from there
 _NIS = "put_at(innovation, 6, g.nis)" if LANES > 1 and not PARAMETERS else ""
 _SOURCE = "\n".join(
-    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows), nis=_NIS)
-    for s, rows in enumerate(ROWS_OF_KIND[t.kind] for t in STRUCTURE.sensors)
+    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows), row=_ROW, nis=_NIS)
+    for s, rows in enumerate(degrees_of_freedom(t.kind) for t in STRUCTURE.sensors)
 )
 _SOURCE += _dispatch("take", "body, measured, e, innovation, like", "False")
 if LANES == 1:

@@ -103,9 +103,6 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
             return definition
     if name in function.__globals__.get("REPLACEABLE", ()):
         return value
-    for module in parts:  # the default of another module
-        if name in vars(module).get("REPLACEABLE", ()):
-            return cast(FunctionType, getattr(module, name))
     names = ", ".join(module.__name__ for module in parts) or "nothing"
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 

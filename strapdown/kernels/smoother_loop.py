@@ -19,7 +19,6 @@ from strapdown.kernels.lane_values import (
     any_lane,
     broadcast,
     fetch,
-    lanes_of,
     load,
     load_quadruples,
     select,
@@ -415,7 +414,6 @@ def smooth_back(segments, starts, first, angle_variance, rate_variance, work, ou
     w = WIDTH
     # Aligned to a cache line, so that vectors do not cross one. Not in a function, because kernels must not return arrays.
     work = work[-(work.ctypes.data // 8) % WIDTH :]
-    lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     for i in range(GROUPS):
         work[i] = 0.0
     k = len(starts) - 1
