@@ -165,7 +165,7 @@ def test_tables_hold_the_numbers_of_the_json(written):
         assert float(row["drift_deg_per_hour"]) == algorithm["drift_deg_per_hour"]
     for row, algorithm in zip(of(written, "coning", "filters"), study["filter"], strict=True):
         assert float(row["bias_mean_z_deg_per_hour"]) == algorithm["bias_mean_deg_per_hour"][2]
-        assert row["consistent"] == str(algorithm["consistent"])
+        assert row["verdict"] == algorithm["verdict"]
     last = json.loads((written / "mc.json").read_text())["last_epoch"]
     errors = of(written, "montecarlo", "errors")
     assert [row["state"] for row in errors] == [f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]
