@@ -446,7 +446,7 @@ def test_recovery_over_200_records(name):
 
 @pytest.mark.slow
 def test_intervals_cover_with_a_ramp_over_200_seeds():
-    inside, _, _ = coverage(200, 1 << 14, 200.0, 20.0, ramp=20.0)
+    inside, *_ = coverage(200, 1 << 14, 200.0, 20.0, ramp=20.0)
     share = inside.mean(axis=0)
     assert np.all((share >= 0.91) & (share <= 0.98)), share
 
