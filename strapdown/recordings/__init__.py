@@ -21,7 +21,7 @@ from __future__ import annotations
 
 # Names imported "as" themselves and not listed in __all__ are for use within the package only.
 from strapdown.recordings.attitudes import Attitudes
-from strapdown.recordings.body_axes import SENSORS, axes_matrix, with_axes
+from strapdown.recordings.body_axes import axes_matrix, with_axes
 from strapdown.recordings.dataframes import from_table
 from strapdown.recordings.formats import (
     FORMATS,

@@ -28,6 +28,7 @@ from strapdown.checks import Array, Hint, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, Recording, outputs
+from strapdown.records.recording import TIME_UNITS
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
@@ -179,10 +180,12 @@ def _of_recording(recording: Recording) -> Attitudes:
     if recording.true_attitude is None:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
     known = np.isfinite(recording.true_attitude).all(axis=1)
-    stamps = recording.epoch_ns + _whole_ns(recording.time[known])
     movement = None if recording.movement is None else recording.movement[known]
     return Attitudes(
-        source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known], movement=movement
+        source=recording.source,
+        stamps_ns=recording.clock_ns[known],
+        attitude=recording.true_attitude[known],
+        movement=movement,
     )
 
 
@@ -199,7 +202,6 @@ COLUMNS: dict[str, str] = {
 """Columns of a table by their content: patterns of whole names, in lower case. ``cov_xy_rad2`` is an element of the covariance of the
 attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one with its axes named; ``sigma_x_deg`` and
 ``yaw_sigma_deg`` are standard deviations, of the rotation vector or of the angles."""
-_TIME = {"s": 10**9, "sec": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
 _STATES = ("x", "y", "z", "bx", "by", "bz")
 _PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
@@ -236,14 +238,13 @@ def _table(path: Path) -> Attitudes:
     time_place, time_unit = named["time"][""]
     places = sorted({place for group in named.values() for place, _ in group.values()})
     numbers = table.load(places, time_place)
-    whole = table.clock_ns(time_place)
+    stamps = table.clock_ns(time_place, "")  # dates, or numbers so large that no other unit makes sense
     columns = {
         name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in named.items()
     }
-    if whole is not None:
-        stamps = np.rint(whole[0] * 1e9).astype(np.int64) + whole[1]
-    else:
-        counts = array(f"{path.name}: time", np.rint(numbers[time_place] * _TIME[time_unit or "s"]), ("m",))
+    if stamps is None:
+        tick = round(1e9 * TIME_UNITS[time_unit.replace("sec", "s") or "s"])
+        counts = array(f"{path.name}: time", np.rint(numbers[time_place] * tick), ("m",))
         if np.any(np.abs(counts) >= 2.0**63):
             raise InputError(
                 f"{path.name}: a time is {numbers[time_place][np.argmax(np.abs(counts))]:g}, which no clock counts"

@@ -13,10 +13,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.records.recording import Recording
-
-SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "magnetic_field"}
-"""Columns by sensor of a recording."""
+from strapdown.records.recording import SENSORS, Recording
 
 
 def axes_matrix(text: str, name: str = "axes") -> Array:

@@ -20,15 +20,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from strapdown.checks import Array, Hint, InputError, instance, known_keys, one_of
 from strapdown.records.recording import (
     CLOCK_OFFSET,
+    FIELDS,
     FORCE_UNITS,
     MAGNETIC_UNITS,
     RATE_UNITS,
+    SENSORS,
     TIME_UNITS,
     Recording,
+    relative_time,
     with_gyro,
 )
 
@@ -42,7 +46,6 @@ GROUPS = {
     "movement": ("movement",),
 }
 """Columns by group."""
-SENSORS = ("gyro", "accelerometer", "magnetometer")
 UNITS: Mapping[str, Mapping[str, float]] = {
     "time": TIME_UNITS,
     "gyro": RATE_UNITS,
@@ -119,7 +122,7 @@ def recording(
     source: str,
     header: Sequence[str],
     load: Callable[[Sequence[int], int], Mapping[int, Array]],
-    clock_ns: Callable[[int], tuple[Array, int] | None],
+    clock_ns: Callable[[int, str], NDArray[np.int64] | None],
     *,
     units: Mapping[str, str] | None = None,
     mapping: Mapping[str, str] | None = None,
@@ -128,18 +131,19 @@ def recording(
     """Return the recording of a table.
 
     ``load`` returns the numbers (n,) of columns, empty fields NaN, from their indices and that of the time, and is called once.
-    ``clock_ns`` returns (time, epoch_ns) of a loaded column of stamps in integer ns or of dates, otherwise None. ``units`` are used if the
-    header declares none. ``mapping`` gives columns by role, optionally with a unit, ``{"gx": "gyro_x [dps]"}``; the others are found by
-    their names.
+    ``clock_ns`` returns the stamps of a loaded column, of the unit that is declared, if it has dates or integers that count ns from 1970;
+    otherwise None. ``units`` are used if the header declares none. ``mapping`` gives columns by role, optionally with a unit,
+    ``{"gx": "gyro_x [dps]"}``; the others are found by their names.
     """
-    for name, value in (("units", units or {}), ("columns", mapping or {})):
+    units, mapping = units or {}, mapping or {}
+    for name, value in (("units", units), ("columns", mapping)):
         instance(name, value, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
-    known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
+    known_keys("units", units, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
     names = Counter(column.name.lower() for column in columns if column.name)
     if twice := [name for name, number in names.items() if number > 1]:
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
-    roles, declared, remark = _roles(source, columns, mapping or {})
+    roles, declared, remark = _roles(source, columns, mapping)
     if gyro_alone:
         roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
     for group, members in GROUPS.items():
@@ -150,36 +154,30 @@ def recording(
                 f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
             )
     present = {_group(role) for role in roles}
-    unit_of_group = _units(source, present, declared, units or {})
+    unit_of_group = _units(source, present, declared, units)
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__
     _need_digits(source, values, roles)
-    stamps = clock_ns(roles["time"])
-    time, epoch = _seconds(values(roles["time"]), TIME_UNITS[unit_of_group["time"]]) if stamps is None else stamps
-    if "time" not in declared and not (units or {}).get("time"):
+    stamps = clock_ns(roles["time"], declared.get("time", ""))
+    if stamps is None:
+        time, epoch = _seconds(values(roles["time"]), TIME_UNITS[unit_of_group["time"]])
+    else:
+        time, epoch = relative_time(stamps)
+    if "time" not in declared and not units.get("time"):
         _need_time_unit(source, columns[roles["time"]].name, time)
-
-    def triple(group: str, factor: float) -> Array:
-        return np.stack([values(roles[role]) for role in GROUPS[group]], axis=1) * factor
-
-    own: dict[str, Any] = {}
-    if "accelerometer" in present:
-        own["specific_force"] = triple("accelerometer", FORCE_UNITS[unit_of_group["accelerometer"]])
-    if "magnetometer" in present:
-        own["magnetic_field"] = triple("magnetometer", 1.0)
-        own["magnetic_unit"] = unit_of_group["magnetometer"]
-    if "temperature" in present:
-        own["temperature"] = values(roles["temperature"])
-    if "reference" in present:
-        own["true_attitude"] = triple("reference", 1.0)
-    if "movement" in present:
-        own["movement"] = values(roles["movement"]) > 0.5
+    fields: dict[str, Any] = {}
+    for group in FIELDS.keys() & present:
+        factor = UNITS[group][unit_of_group[group]] if group in ("gyro", "accelerometer") else 1.0
+        samples = np.stack([values(roles[role]) for role in GROUPS[group]], axis=1) * factor
+        fields[FIELDS[group]] = samples if samples.shape[1] > 1 else samples[:, 0]
+    if "movement" in fields:
+        fields["movement"] = fields["movement"] > 0.5
     return with_gyro(
         source=source,
         time=time,
-        rate=triple("gyro", RATE_UNITS[unit_of_group["gyro"]]),
         epoch_ns=epoch,
+        magnetic_unit=unit_of_group.get("magnetometer", ""),
         remarks=(remark,) if remark else (),
-        **own,
+        **fields,
     )
 
 

@@ -21,7 +21,7 @@ from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import recording_columns, write_columns
 from strapdown.records import Estimate
-from strapdown.records.recording import CLOCK_OFFSET, Recording, relative_time
+from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 
 def from_table(
@@ -50,16 +50,14 @@ def from_table(
         converted = x.astype(np.float64) if x.dtype.kind == "b" or (k == time and x.dtype.kind in "mM") else x
         return numbers(f"{source}: column {names[k]}", converted, allow_nan=True)
 
-    def clock_ns(k: int) -> tuple[Array, int] | None:
+    def clock_ns(k: int, unit: str) -> NDArray[np.int64] | None:
         x = arrays[k]
         if x.dtype.kind in "mM":
             if np.isnat(x).any():
                 raise InputError(f"{source}: {names[k]}[{int(np.argmax(np.isnat(x)))}] is not a date; drop such rows")
-            return relative_time(x.astype("M8[ns]" if x.dtype.kind == "M" else "m8[ns]").astype(np.int64))
-        unit = naming.unit_of("time", naming.column(names[k]).unit) or (units or {}).get("time", "")
-        if x.dtype.kind in "iu" and len(x) and unit in ("", "ns") and abs(int(x[0])) > CLOCK_OFFSET * 1e9:
-            return relative_time(x.astype(np.int64))
-        return None
+            return x.astype(f"{x.dtype.kind}8[ns]").astype(np.int64)
+        large = x.dtype.kind in "iu" and unit in ("", "ns") and len(x) and abs(int(x[0])) > CLOCK_OFFSET * 1e9
+        return x.astype(np.int64) if large else None
 
     return naming.recording(
         source,
@@ -181,8 +179,7 @@ def _is_number(kind: Any) -> bool:
 
 def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording as Parquet, with its units as metadata of the fields."""
-    columns, unit = recording_columns(recording)
-    write_parquet_columns(path, columns, unit)
+    write_parquet_columns(path, *recording_columns(recording))
 
 
 def write_parquet_columns(

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from strapdown.checks import Array, InputError
 from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
-from strapdown.records.recording import CLOCK_OFFSET, Recording
+from strapdown.records.recording import CLOCK_OFFSET, FIELDS, Recording
 
 SEPARATORS = ",;\t|"
 _LARGE = 10**15
@@ -105,14 +105,11 @@ class Table:
                 f"{self.source}: data row {row + 1}, column {self.header[place]} is {cell!r}, not a number"
             ) from None
 
-    def clock_ns(self, k: int) -> tuple[Array, int] | None:
-        """Return time and epoch of a loaded column of large integer stamps, in ns; None for other columns."""
-        whole = self._whole.get(k)
-        unit = naming.unit_of("time", naming.column(self.header[k]).unit)
-        if not whole or unit not in ("", "ns") or whole[0] < CLOCK_OFFSET * 1e9 or len(whole) != self._rows_read:
-            return None
-        stamps = np.array(whole, dtype=np.int64)
-        return (stamps - stamps[0]) / 1e9, whole[0]
+    def clock_ns(self, k: int, unit: str) -> NDArray[np.int64] | None:
+        """Return the stamps of a loaded column of a unit, "" if unknown, that counts ns from 1970; None for other columns."""
+        whole = self._whole.get(k, [])
+        large = len(whole) == self._rows_read and whole[0] > CLOCK_OFFSET * 1e9
+        return np.array(whole, np.int64) if large and unit in ("", "ns") else None
 
 
 def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]:
@@ -203,18 +200,12 @@ def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generi
     clock = bool(recording.epoch_ns)
     columns: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
     unit = {"time": "ns" if clock else "s"}
-    triples = {
-        "gyro": (recording.rate, "rad/s"),
-        "accelerometer": (recording.specific_force, "m/s2"),
-        "magnetometer": (recording.magnetic_field, recording.magnetic_unit),
-        "temperature": (None if recording.temperature is None else recording.temperature[:, None], "degC"),
-        "reference": (recording.true_attitude, ""),
-        "movement": (None if recording.movement is None else recording.movement[:, None].astype(np.int64), ""),
-    }
-    for group, (values, name) in triples.items():
-        if values is not None:
-            columns |= {role: values[:, k] for k, role in enumerate(naming.GROUPS[group])}
-            unit |= dict.fromkeys(naming.GROUPS[group], name) if name else {}
+    units = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": recording.magnetic_unit, "temperature": "degC"}
+    for group in recording.parts:
+        values, roles = getattr(recording, FIELDS[group]), naming.GROUPS[group]
+        values = values.astype(np.int64) if group == "movement" else values
+        columns |= dict(zip(roles, values.reshape(len(values), -1).T, strict=True))
+        unit |= dict.fromkeys(roles, units[group]) if units.get(group) else {}
     return columns, unit
 
 

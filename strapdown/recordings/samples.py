@@ -12,12 +12,11 @@ import numpy as np
 from strapdown.checks import Array, Hint, InputError, array, one_of, positive
 from strapdown.files import reading
 from strapdown.recordings import formats, recordfiles
-from strapdown.recordings.body_axes import SENSORS as COLUMN_OF
 from strapdown.recordings.broad import sample_interval
-from strapdown.recordings.columns import SENSORS, UNITS
+from strapdown.recordings.columns import UNITS
 from strapdown.recordings.gyro_temperature import temperature_at_samples
 from strapdown.records import ImuRecord
-from strapdown.records.recording import GAP, Recording, field_in
+from strapdown.records.recording import GAP, SENSORS, Recording, field_in
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +126,7 @@ def _read_array(file: Path, sensor: str, rate: float | None, unit_of_sensor: Map
 
 def _of_recording(recording: Recording, sensor: str) -> GyroSamples:
     """Return one sensor's samples, SI; for a sensor of lower rate, only the stamps where it has samples."""
-    values = getattr(recording, COLUMN_OF[sensor])
+    values = getattr(recording, SENSORS[sensor])
     if values is None:
         raise InputError(f"{recording.source} has no {sensor}; choose another sensor or file")
     if sensor == "magnetometer":

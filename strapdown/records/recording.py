@@ -33,7 +33,11 @@ BRIDGED = 0.1
 GAP = 5.0
 """Minimum interval between stamps that counts as a gap, in median intervals."""
 
-_ROWS = ("time", "rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement")
+SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "magnetic_field"}
+"""Field of a recording by sensor."""
+FIELDS = {**SENSORS, "temperature": "temperature", "reference": "true_attitude", "movement": "movement"}
+"""Field by what a recording may contain."""
+_ROWS = ("time", *FIELDS.values())
 
 
 FEW_REPEATED = 0.01
@@ -105,11 +109,8 @@ class Recording(Listed):
                 f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
                 "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
             )
-        for name, sensor in (
-            ("specific_force", "accelerometer"),
-            ("magnetic_field", "magnetometer"),
-            ("true_attitude", "reference"),
-        ):
+        for sensor in ("accelerometer", "magnetometer", "reference"):
+            name = FIELDS[sensor]
             value = getattr(self, name)
             if value is not None:
                 value = array(f"{self.source}: {name}", value, (n, 4 if sensor == "reference" else 3), allow_nan=True)
@@ -204,14 +205,7 @@ class Recording(Listed):
     @property
     def parts(self) -> tuple[str, ...]:
         """Quantities that it contains."""
-        held = {
-            "accelerometer": self.specific_force,
-            "magnetometer": self.magnetic_field,
-            "temperature": self.temperature,
-            "reference": self.true_attitude,
-            "movement": self.movement,
-        }
-        return ("gyro", *(name for name, values in held.items() if values is not None))
+        return tuple(name for name, field in FIELDS.items() if getattr(self, field) is not None)
 
     @property
     def left_out_words(self) -> str:
