@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, Hint, InputError, array, one_of
+from strapdown.checks import Array, Hint, InputError, array
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, Recording, outputs
@@ -320,16 +320,16 @@ def _unit(name: str, q: Array) -> Array:
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
     topics, _, words = ros.topics_of(path, ros.ORIENTED)
-    chosen_topic = _topic(path.name, topics, topic)
-    number = len(topics[chosen_topic])
-    stamps, values, order_words = topics[chosen_topic].decoded(path.name)
+    oriented = ros.chosen(path.name, topics, topic, "topics with orientations", list(ros.ORIENTED))
+    stamps, values, order_words = oriented.decoded(path.name)
     q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
     known = q.any(axis=1) & (P[:, 0] != -1.0 if P.size else True)
     if known.sum() < 2:
-        raise InputError(f"{path.name}: topic {chosen_topic} has no orientation in its {number} messages")
+        raise InputError(f"{path.name}: topic {oriented.name} has no orientation in its {len(oriented)} messages")
     stamps, q, P = stamps[known], q[known], P[known]
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
-    remarks = [f"Topic {chosen_topic}: {int(fresh.sum())} orientations of {number} messages.", *words, *order_words]
+    count = f"Topic {oriented.name}: {int(fresh.sum())} orientations of {len(oriented)} messages."
+    remarks = [count, *words, *order_words]
     covariance = None
     if P.any():
         covariance = (P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3))[fresh]
@@ -342,17 +342,6 @@ def _bag(path: Path, topic: str) -> Attitudes:
         covariance=covariance,
         remarks=tuple(remarks),
     )
-
-
-def _topic(name: str, topics: Mapping[str, ros.Topic], topic: str) -> str:
-    if not topics:
-        raise InputError(f"{name} has no topic of {', '.join(kind.rpartition('/')[2] for kind in ros.ORIENTED)}")
-    if topic:
-        return one_of(f"{name}: topic", topic, topics)
-    if len(topics) > 1:
-        listed = ", ".join(f"{t} ({c.kind.rpartition('/')[2]}, {len(c)} messages)" for t, c in topics.items())
-        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by {Hint('topic')}")
-    return next(iter(topics))
 
 
 # -------------------------------------------------------------------------------------------------------------- ULog
@@ -371,28 +360,25 @@ def _ulog(path: Path) -> Attitudes:
     }
     remarks: list[str] = []
     covariance = None
-    if _STATES_TOPIC in data:
-        rows = data[_STATES_TOPIC]
-        stamps, kept, _ = ulog.in_order(_STATES_TOPIC, rows.get("timestamp_sample", rows["timestamp"]))
-        ned = _unit(path.name, ulog.columns(rows, "states", 4)[kept])
-        number = sum(name.startswith("covariances[") for name in rows)
-        if number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq
-            xi = np.stack([_quaternion_columns(dataset) for dataset in ned])
-            variance = ulog.columns(rows, "covariances", 4)[kept]
-            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, variance, xi)
-            remarks.append(
-                "The log has the variances of the quaternion without their correlations: σ of the attitude is approximate."
-            )
-        elif number > 0:
-            covariance = np.apply_along_axis(np.diag, 1, ulog.columns(rows, "covariances", 3)[kept])
-            remarks.append("The log has the variances of the attitude error without their correlations.")
-    elif ulog.ATTITUDE in data:
-        rows = data[ulog.ATTITUDE]
-        stamps, kept, _ = ulog.in_order(ulog.ATTITUDE, rows.get("timestamp_sample", rows["timestamp"]))
-        ned = _unit(path.name, ulog.columns(rows, "q", 4)[kept])
-        remarks.append(f"{ulog.ATTITUDE}: no covariance.")
-    else:
+    topic = next((name for name in (_STATES_TOPIC, ulog.ATTITUDE) if name in data), None)
+    if topic is None:
         raise InputError(f"{path.name} has neither {_STATES_TOPIC} nor {ulog.ATTITUDE}; log one of them")
+    rows = data[topic]
+    stamps, kept, _ = ulog.in_order(topic, rows.get("timestamp_sample", rows["timestamp"]))
+    ned = _unit(path.name, ulog.columns(rows, "q" if topic == ulog.ATTITUDE else "states", 4)[kept])
+    number = sum(name.startswith("covariances[") for name in rows)
+    if topic == ulog.ATTITUDE:
+        remarks.append(f"{ulog.ATTITUDE}: no covariance.")
+    elif number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq, where the columns of Ξ are q ⊗ (0, e)
+        xi = np.stack([quaternion.multiply(ned, [0.0, *axis]) for axis in np.eye(3)], axis=2)
+        variance = ulog.columns(rows, "covariances", 4)[kept]
+        covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, variance, xi)
+        remarks.append(
+            "The log has the variances of the quaternion without their correlations: σ of the attitude is approximate."
+        )
+    elif number > 0:
+        covariance = np.apply_along_axis(np.diag, 1, ulog.columns(rows, "covariances", 3)[kept])
+        remarks.append("The log has the variances of the attitude error without their correlations.")
     if covariance is not None and not (np.diagonal(covariance, axis1=1, axis2=2) > 0.0).all():
         covariance = None
         remarks.append("Its variances are not all above zero and are left out.")
@@ -410,20 +396,9 @@ def _ulog(path: Path) -> Attitudes:
     )
 
 
-def _quaternion_columns(q: Array) -> Array:
-    """Return Ξ (4, 3) of ``δq = ½ Ξ δθ``, the body-side error."""
-    w, x, y, z = q
-    return np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
-
-
 def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], first: int) -> dict[str, Innovations]:
     """Return innovations by field; a value equal to that of the row before is not a new measurement."""
-    at = np.asarray(values["timestamp"]).astype(np.int64)
-    beside = {stamp: k for k, stamp in enumerate(np.asarray(variances["timestamp"]).astype(np.int64).tolist())}
-    rows = np.array([k for k, stamp in enumerate(at.tolist()) if stamp in beside], np.int64)
-    if not len(rows):
-        return {}
-    other = np.array([beside[stamp] for stamp in at[rows].tolist()], np.int64)
+    at, rows, other = np.intersect1d(values["timestamp"], variances["timestamp"], return_indices=True)
     fields: dict[str, list[str]] = {}
     for name in values:
         if not name.startswith("timestamp") and name in variances:
@@ -435,5 +410,6 @@ def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], f
         new = np.isfinite(e).all(axis=1) & np.isfinite(s).all(axis=1) & (s > 0.0).all(axis=1)
         new &= np.concatenate([[True], np.any(np.diff(e, axis=0) != 0.0, axis=1)])
         if new.sum() > 1:
-            innovations[name] = Innovations(time=(at[rows][new] - first) / 1e6, innovation=e[new], variance=s[new])
+            time = (at[new].astype(np.int64) - first) / 1e6
+            innovations[name] = Innovations(time=time, innovation=e[new], variance=s[new])
     return innovations

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,30 +31,29 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
             )
         if kind.startswith("strapdown "):
             raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
-        missing = [key for key in ("imu_gyr",) if key not in file]
-        if "sampling_rate" not in held:
-            missing.append("the attribute sampling_rate")
+        missing = ["imu_gyr"] * ("imu_gyr" not in file) + ["the attribute sampling_rate"] * (
+            "sampling_rate" not in held
+        )
         if missing:
             raise InputError(
                 f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
             )
-        columns = {key: reading.numbers(file, key) for key in _READ if key in file}
-        movement = columns.get("movement")
+        fields: dict[str, Any] = {field: reading.numbers(file, key) for key, field in _FIELDS.items() if key in file}
         sampling = positive(f"{name}: sampling_rate", held["sampling_rate"], unit="Hz")
-        return with_gyro(
-            source=name,
-            time=np.arange(len(columns["imu_gyr"])) / sampling,
-            rate=columns["imu_gyr"],
-            specific_force=columns.get("imu_acc"),
-            magnetic_field=columns.get("imu_mag"),
-            magnetic_unit="uT" if "imu_mag" in columns else "",
-            true_attitude=columns.get("opt_quat"),
-            movement=None if movement is None else movement.astype(bool),
-        )
+        if "movement" in fields:
+            fields["movement"] = fields["movement"].astype(bool)
+        unit = "uT" if "magnetic_field" in fields else ""
+        return with_gyro(source=name, time=np.arange(len(fields["rate"])) / sampling, magnetic_unit=unit, **fields)
 
 
-_READ = ("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement")
-"""Data sets that are read."""
+_FIELDS = {
+    "imu_gyr": "rate",
+    "imu_acc": "specific_force",
+    "imu_mag": "magnetic_field",
+    "opt_quat": "true_attitude",
+    "movement": "movement",
+}
+"""Fields of a recording by data set."""
 EVEN = 1e-3
 """Maximum relative deviation of a sample interval from the mean, for the intervals to count as equal."""
 
@@ -74,16 +74,11 @@ def sample_interval(source: str, time: Array) -> float:
 def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording with equal sample intervals in the layout of BROAD, which has no clock."""
     interval = sample_interval(recording.source, recording.time)
-    known = recording.magnetic_field is not None and recording.magnetic_unit
-    content = {
-        "imu_gyr": recording.rate,
-        "imu_acc": recording.specific_force,
-        "imu_mag": field_in("uT", recording) if known else recording.magnetic_field,
-        "opt_quat": recording.true_attitude,
-        "movement": recording.movement,
-    }
+    content = {key: getattr(recording, field) for key, field in _FIELDS.items()}
+    if recording.magnetic_field is not None and recording.magnetic_unit:
+        content["imu_mag"] = field_in("uT", recording)
     with atomic_write(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs["sampling_rate"] = 1.0 / interval
-        for name, value in content.items():
+        for key, value in content.items():
             if value is not None:
-                file.create_dataset(name, data=value)
+                file.create_dataset(key, data=value)

@@ -153,7 +153,6 @@ def read_parquet(
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
-    reading.existing_file(file)
     with parquet.ParquetFile(file, page_checksum_verification=True) as content:
         schema, rows = content.schema_arrow, content.metadata.num_rows
         flat = [k for k, entry in enumerate(schema) if _is_number(entry.type)]

@@ -138,28 +138,21 @@ FORMATS: tuple[Format, ...] = (
 
 def format_of(path: str | os.PathLike[str]) -> Format:
     """Return the format of a file or folder by its content, or by its extension if the content is not conclusive."""
-    file = Path(path)
-    if not file.exists():
-        raise InputError(f"{path} does not exist; check the path")
-    head = b""
+    file, head = Path(path), b""
     if not file.is_dir():
         with reading.opened(file) as stream:
             head = stream.read(HEAD)
-    table = FORMATS[-1]
-    recognised = next(
-        (candidate for candidate in FORMATS if candidate is not table and candidate.recognised(file, head)), None
-    )
-    if recognised is not None:
-        return recognised
-    if file.is_dir():
+    *others, table = FORMATS
+    recognised = [candidate for candidate in others if candidate.recognised(file, head)]
+    if file.is_dir() and not recognised:
         raise InputError(
             f"{path} is a folder; name the file in it (folders that can be read: a ROS 2 bag, or EuRoC with imu0/data.csv)"
         )
-    by_ending = next((candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings), None)
-    if by_ending is not None:
-        return by_ending
+    recognised += [candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings]
     if table.recognised(file, head):
-        return table
+        recognised.append(table)
+    if recognised:
+        return recognised[0]
     known = (
         f"{candidate.name} ({' or '.join(candidate.endings)})" if candidate.endings else candidate.name
         for candidate in FORMATS
@@ -168,6 +161,14 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     raise InputError(
         f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {', '.join(known)}"
     )
+
+
+_REASONS = {
+    "units": "its layout defines its units",
+    "columns": "columns are for a table (CSV, Parquet)",
+    "topic": "a topic is for a bag or a flight log",
+}
+"""Why a format has no such option of :func:`read`."""
 
 
 def _function(place: str) -> Callable[..., Any]:
@@ -193,19 +194,12 @@ def read(
         raise InputError(
             f"{file.name} is a {file_format.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
-    choices = {"units": units or {}, "columns": columns or {}, "topic": topic}
-    needed = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}
-    for name, value in choices.items():
-        if value and name not in file_format.options and name in needed:
-            raise InputError(f"{file.name} ({file_format.name}): {needed[name]}; drop the option")
-        if value and name not in file_format.options:
-            said = file_format.name if file_format.name != "BROAD" else "HDF5"
-            raise InputError(
-                f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
-            )
-    options: dict[str, Any] = {name: value for name, value in choices.items() if name in file_format.options}
-    if "gyro_alone" in file_format.options:
-        options["gyro_alone"] = gyro_alone
+    options = {"units": units or {}, "columns": columns or {}, "topic": topic, "gyro_alone": gyro_alone}
+    for name, reason in _REASONS.items():
+        if options[name] and name not in file_format.options:
+            which = f" for {', '.join(units)}" if units and name == "units" else ""
+            raise InputError(f"{file.name} ({file_format.name}): {reason}; drop the option{which}")
+    options = {name: value for name, value in options.items() if name in file_format.options}
     with reading.from_file(file, file_format.name):
         recording: Recording = _function(file_format.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording

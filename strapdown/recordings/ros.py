@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from strapdown.checks import Array, Hint, InputError, one_of
 from strapdown.files.extras import library
 from strapdown.recordings.bag_files import Add, Bag, Data, write_checksums
 from strapdown.records import Estimate
-from strapdown.records.recording import Recording, at_nearest, field_in, matched, relative_time, with_gyro
+from strapdown.records.recording import Recording, beside, field_in, matched, relative_time, with_gyro
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",
@@ -129,7 +129,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     file = Path(path)
     topics, _, remarks = topics_of(file, READ)
-    topic_name = _chosen(file.name, topics, topic)
+    topic_name = chosen(file.name, topics, topic, "inertial units", [IMU]).name
     stamps, values, order_words = topics[topic_name].decoded(file.name)
     said = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks, *order_words]
     if values[0, 3] == -1.0:
@@ -147,33 +147,30 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         other_stamps, other_values, words = other.decoded(file.name)
         # In ROS, w is last in a quaternion.
         places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]
-        own[name], lost = at_nearest(time, (other_stamps - epoch) / 1e9, other_values[:, places])
-        said += [
-            f"Topic {other.name}: {len(other_stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
-        ]
-        said += words
-    if "magnetic_field" in own:
-        own["magnetic_unit"] = "T"
+        own[name], remark = beside(other.name, other_stamps, other_values[:, places], time, epoch)
+        said += [remark, *words]
     if "temperature" in own:
         own["temperature"] = own["temperature"][:, 0]
-    return with_gyro(source=file.name, time=time, rate=values[:, :3], epoch_ns=epoch, remarks=tuple(said), **own)
+    unit = "T" if "magnetic_field" in own else ""
+    return with_gyro(
+        source=file.name, time=time, rate=values[:, :3], magnetic_unit=unit, epoch_ns=epoch, remarks=tuple(said), **own
+    )
 
 
-def _chosen(name: str, topics: Mapping[str, Topic], topic: str) -> str:
-    """Return the topic of the inertial unit: the one given, or the only one."""
-    units = {t.name: t for t in topics.values() if t.kind == IMU}
-    listed = ", ".join(f"{t.name} ({len(t)} messages)" for t in units.values())
-    if topic:
-        if not units:
-            raise InputError(f"{name} has no topic of {IMU} (it has: {', '.join(topics) or 'none that is read'})")
-        return one_of(f"{name}: topic", topic, units)
-    filled = [t.name for t in units.values() if len(t)]
+def chosen(name: str, topics: Mapping[str, Topic], topic: str, what: str, kinds: Collection[str]) -> Topic:
+    """Return the topic of one of these kinds that is named, or the only one; ``what`` they are, for messages."""
+    filled = {t.name: t for t in topics.values() if t.kind in kinds and len(t)}
     if not filled:
-        what = f"no message of {IMU}" + (f" on {listed}" if units else "")
-        raise InputError(f"{name} has {what}; give a bag of an inertial unit")
-    if len(filled) > 1:
-        raise InputError(f"{name} has several inertial units: {listed}; choose one, {Hint('topic', filled[0])}")
-    return filled[0]
+        others = f" (it has: {', '.join(topics)})" if topics else ""
+        raise InputError(f"{name} has no message of {' or '.join(kinds)}{others}; give a bag with {what}")
+    if topic:
+        return filled[one_of(f"{name}: topic", topic, filled)]
+    first, *more = filled.values()
+    if more:
+        kind = {t.name: f"{t.kind.rpartition('/')[2]}, " if len(kinds) > 1 else "" for t in filled.values()}
+        listed = ", ".join(f"{t.name} ({kind[t.name]}{len(t)} messages)" for t in filled.values())
+        raise InputError(f"{name} has several {what}: {listed}; choose one, {Hint('topic', first.name)}")
+    return first
 
 
 def _beside(unit: str, candidates: list[Topic]) -> Topic | str | None:
@@ -308,19 +305,18 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
     else:
         imu[:, 25:28] = recording.specific_force
     series: list[_Series] = [(IMU, stamps, imu)]
-    if recording.magnetic_field is not None:
-        known = ~np.isnan(recording.magnetic_field).any(axis=1)
-        magnetic = np.zeros((int(known.sum()), DOUBLES[FIELD]))
-        magnetic[:, :3] = field_in("T", recording)[known]
-        series.append((FIELD, stamps[known], magnetic))
-    if recording.temperature is not None:
-        known = ~np.isnan(recording.temperature)
-        series.append(
-            (TEMPERATURE, stamps[known], np.stack([recording.temperature[known], np.zeros(known.sum())], axis=1))
-        )
-    if recording.true_attitude is not None:
-        known = ~np.isnan(recording.true_attitude).any(axis=1)
-        series.append((REFERENCE, stamps[known], recording.true_attitude[known][:, [1, 2, 3, 0]]))
+    attitude = recording.true_attitude
+    others = {
+        FIELD: None if recording.magnetic_field is None else field_in("T", recording),
+        TEMPERATURE: None if recording.temperature is None else recording.temperature[:, None],
+        REFERENCE: None if attitude is None else attitude[:, [1, 2, 3, 0]],
+    }
+    for kind, values in others.items():
+        if values is not None:
+            known = ~np.isnan(values).any(axis=1)
+            numbers = np.zeros((int(known.sum()), DOUBLES[kind]))
+            numbers[:, : values.shape[1]] = values[known]
+            series.append((kind, stamps[known], numbers))
     return series
 
 
@@ -364,7 +360,12 @@ def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), ba
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{target.stem}-", dir=target.parent) as folder:
         place = Path(folder) / f"bag{'' if ros2 else '.bag'}"
-        with _writer(place, target.suffix.lower(), what) as writer:
+        rosbag = library(f"rosbags.rosbag{2 if ros2 else 1}", what)
+        options: dict[str, Any] = {}
+        if ros2:
+            plugin = "MCAP" if target.suffix.lower() == ".mcap" else "SQLITE3"
+            options = {"version": 9, "storage_plugin": rosbag.StoragePlugin[plugin]}
+        with rosbag.Writer(place, **options) as writer:
             queue: list[tuple[int, Any, Data]] = []
             for kind, stamps, numbers in series:
                 name = WITH_ORIENTATION if kind == IMU and np.any(numbers[:, 4] != -1.0) else TOPICS[kind]
@@ -382,14 +383,6 @@ def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), ba
         if target.is_dir():
             raise InputError(f"{target} is a folder; choose another name")
         shutil.move(written, target)
-
-
-def _writer(place: Path, suffix: str, what: str) -> Any:
-    if suffix == ".bag":
-        return library("rosbags.rosbag1", what).Writer(place)
-    rosbag2 = library("rosbags.rosbag2", what)
-    plugin = rosbag2.StoragePlugin.MCAP if suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
-    return rosbag2.Writer(place, version=9, storage_plugin=plugin)
 
 
 def _copied(writer: Any, topics: Sequence[Topic], bag: Bag, known: Any) -> list[tuple[int, Any, Data]]:

@@ -67,9 +67,7 @@ def read_samples(
             what = "a record, which declares its own layout" if simulated else "one array"
             raise InputError(f"{file.name} is {what}; leave {Hint(name, value)} out")
     if npy:
-        reading.existing_file(file)
-        with reading.from_file(file):
-            samples = _read_array(file, sensor, rate, unit_of_sensor)
+        samples = _read_array(file, sensor, rate, unit_of_sensor)
     elif rate is not None:
         raise InputError(f"{file.name} states its own rate; drop the option rate")
     elif simulated:
@@ -115,10 +113,10 @@ def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: 
 
 
 def _read_array(file: Path, sensor: str, rate: float | None, unit_of_sensor: Mapping[str, str]) -> GyroSamples:
-    names = " or ".join(list(UNITS[sensor])[:2]) if sensor == "gyro" else " or ".join(UNITS[sensor])
-    if rate is None or sensor not in unit_of_sensor:
-        raise InputError(f"{file.name} is an array without rate and unit; give its rate in Hz and its unit ({names})")
     values = reading.npy(file)
+    if rate is None or sensor not in unit_of_sensor:
+        names = " or ".join(UNITS[sensor])
+        raise InputError(f"{file.name} is an array without rate and unit; give its rate in Hz and its unit ({names})")
     factor = UNITS[sensor][one_of(f"{file.name}: unit of the {sensor}", unit_of_sensor[sensor], UNITS[sensor])]
     axes = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
     return GyroSamples(values=axes * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate")

@@ -40,7 +40,6 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
     """Read the inertial unit of a camera's, flight controller's or phone's log."""
     file = Path(path)
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
-    reading.existing_file(file)
     with tempfile.TemporaryDirectory() as folder:
         named, ending = file, _ending(file)
         if file.suffix.lower() != ending:  # a link with the extension that the library requires

@@ -46,8 +46,7 @@ def read_euroc(path: str | os.PathLike[str]) -> Recording:
     """Read a folder of EuRoC or TUM-VI: the inertial unit, and the ground truth if there is one."""
     folder = Path(path)
     root = _root(folder)
-    if root is None:
-        raise InputError(f"{path} has no imu0/data.csv; give the folder of a EuRoC or TUM-VI sequence")
+    assert root is not None  # by which its format was recognised
     recording = replace(read_csv(root / "imu0" / "data.csv"), source=folder.name, remarks=("EuRoC layout, imu0.",))
     truth = next((root / name / "data.csv" for name in TRUTHS if (root / name / "data.csv").is_file()), None)
     if truth is None:

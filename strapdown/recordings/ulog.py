@@ -27,7 +27,7 @@ from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading
 from strapdown.files.extras import library
 from strapdown.records import outputs
-from strapdown.records.recording import Recording, at_nearest, interpolated, relative_time, with_gyro
+from strapdown.records.recording import Recording, beside, interpolated, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 TRUTH = "vehicle_attitude_groundtruth"
@@ -77,15 +77,17 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         )
     own: dict[str, Any] = {}
     if FIELD in data:
-        own["magnetic_field"] = _beside(FIELD, data[FIELD], "magnetometer_ga", time, epoch, remarks)
+        at, kept, words = in_order(FIELD, data[FIELD].get("timestamp_sample", data[FIELD]["timestamp"]))
+        samples = columns(data[FIELD], "magnetometer_ga", 3)[kept]
+        own["magnetic_field"], remark = beside(FIELD, at * 1000, samples, time, epoch)
+        remarks += [remark, *words]
     elif "magnetometer_ga[0]" in rows:
         field = columns(rows, "magnetometer_ga", 3)[order]
         field[np.asarray(rows.get("magnetometer_timestamp_relative", np.zeros(len(order))))[order] == NO_SAMPLE] = (
             np.nan
         )
         own["magnetic_field"] = field
-    if "magnetic_field" in own:
-        own["magnetic_unit"] = "G"
+    own["magnetic_unit"] = "G" if "magnetic_field" in own else ""
     reference = next((name for name in (TRUTH, ATTITUDE) if name in data and len(data[name]["timestamp"]) > 1), None)
     if reference is not None:
         at, kept, words = in_order(reference, data[reference]["timestamp"])
@@ -196,12 +198,3 @@ def in_order(topic: str, timestamp: Any) -> tuple[NDArray[np.int64], NDArray[np.
         words.append(f"{twice} messages of {topic} have the stamp of the one before and were left out.")
     kept = order[fresh]
     return stamps[kept], kept, words
-
-
-def _beside(topic: str, rows: dict[str, Any], name: str, time: Array, epoch: int, remarks: list[str]) -> Array:
-    """Return a sensor's samples at the nearest stamps of the inertial unit, by ``timestamp_sample`` if the topic has it."""
-    stamps, kept, words = in_order(topic, rows.get("timestamp_sample", rows["timestamp"]))
-    values, lost = at_nearest(time, (stamps * 1000 - epoch) / 1e9, columns(rows, name, 3)[kept])
-    remarks.append(f"Topic {topic}: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}.")
-    remarks += words
-    return values

@@ -285,6 +285,12 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
     return placed, int(len(other) - len(np.unique(nearest[usable])))
 
 
+def beside(topic: str, stamps_ns: NDArray[np.int64], values: Array, time: Array, epoch_ns: int) -> tuple[Array, str]:
+    """Return the samples of another topic of a log at the nearest of ``time``, and a remark that counts them."""
+    placed, lost = at_nearest(time, (stamps_ns - epoch_ns) / 1e9, values)
+    return placed, f"Topic {topic}: {len(stamps_ns)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
+
+
 def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED) -> Array:
     """Return attitudes (n, 4) at ``time`` (n,) between unit quaternions at ``stamps`` along the shortest rotation.
 
