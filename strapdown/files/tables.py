@@ -156,9 +156,9 @@ def construct(
 
 
 def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:
-    said = re.sub(r"\[[\d, ]*\]$", "", text.split(" is ", 1)[0])
+    said, verb, _ = text.partition(" is ")
     for key, (name, _) in keys(form).items():
-        if key in table and said.endswith(name):
+        if verb and key in table and re.sub(r"\[[\d, ]*\]$", "", said).endswith(name):
             return f"{text} ({place}: {key} = {table[key]!r})"
     return text if text.startswith(place.split(":", 1)[0]) else f"{place}: {text}"
 

@@ -23,36 +23,18 @@ from strapdown.results import Table
 from strapdown.scenarios import toml
 from strapdown.scenarios.scenario import Scenario, Temperature
 
-SYMBOLS = {
-    "": "",
-    "s": "s",
-    "hz": "Hz",
-    "m": "m",
-    "km": "km",
-    "degc": "°C",
-    "kg_m2": "kg m²",
+_SYMBOLS = {
     "deg": "°",
-    "rad": "rad",
+    "degc": "°C",
     "arcsec": "″",
-    "mrad": "mrad",
-    "ppm": "ppm",
     "ratio": "1",
+    "hz": "Hz",
     "nt": "nT",
     "t": "T",
-    "deg_per_s": "°/s",
-    "deg_per_hour": "°/h",
-    "deg_per_sqrt_hour": "°/√h",
-    "deg_per_hour_per_sqrt_hour": "°/h/√h",
-    "deg_per_hour_per_hour": "°/h²",
-    "deg_per_hour_per_g": "°/h/g",
-    "rad_per_s": "rad/s",
-    "rad_per_sqrt_s": "rad/√s",
-    "rad_per_s_per_sqrt_s": "rad/s/√s",
-    "rad_per_s2": "rad/s²",
-    "rad_s_per_m": "rad s/m",
-    "m_per_s2": "m/s²",
+    "hour": "h",
+    "sqrt": "√",
 }
-"""The unit that each ending of a key stands for."""
+"""Symbols of the words in the ending of a key that are not symbols themselves."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,9 +69,7 @@ class Section:
 
 def sections() -> list[Section]:
     """Return every table of a scenario file, in its order, one for each type of motion and of sensor."""
-    said = _meanings(Scenario)
-    names = (_text(name, said.get(name, "")) for name in ("name", "description"))
-    keys = (*names, *_keys(Scenario, toml.TOP_FORM))
+    keys = _keys(Scenario, toml.TOP_FORM)
     top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
     warm = _section("gyro", "[temperature]", Temperature, _keys(Temperature, toml.TEMPERATURE))
     sensors = [
@@ -174,14 +154,15 @@ def _motions() -> list[Section]:
 
 def _gyro() -> Section:
     names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
-    preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
+    meaning = f"A gyro on the market, of which other keys change what they name. One of {names}."
+    example = next(iter(datasheets.PRESETS))
+    preset = Key(name="preset", type="text", default="none", meaning=meaning, example=example)
     own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
-    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
     summary = (
         "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan` "
         "writes it to `gyro-temperature.toml`."
     )
-    return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
+    return Section(group="gyro", header="[gyro]", summary=summary, keys=(preset, *own))
 
 
 # ------------------------------------------------------------------------------------------------------- from the dataclasses
@@ -205,7 +186,7 @@ def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meanin
     return Key(
         name=names[0],
         others=tuple(names[1:]),
-        unit=SYMBOLS[suffix],
+        unit=symbol(suffix),
         type=kind,
         default="required" if default is dataclasses.MISSING else _toml(example),
         meaning=meaning,
@@ -230,8 +211,10 @@ def _type(hint: Any, default: Any) -> str:
 _EXAMPLES: dict[str, Any] = {"text": "some text", "number": 1.0, "list of 3": [1.0, 1.0, 1.0]}
 
 
-def _text(name: str, meaning: str) -> Key:
-    return Key(name=name, type="text", default="none", meaning=meaning, example="some text")
+def symbol(ending: str) -> str:
+    """Return the unit that the ending of a key stands for: ``deg_per_sqrt_hour`` is °/√h."""
+    text = re.sub(r"[a-z]+", lambda word: _SYMBOLS.get(word[0], word[0]), ending.replace("_per_", "/"))
+    return text.replace("√_", "√").replace("_", " ").replace("2", "²").replace("h/h", "h²")
 
 
 def _toml(value: Any) -> str:

@@ -92,12 +92,14 @@ SENSORS: dict[str, tuple[type, Form, Form]] = {
 one instead of its field."""
 
 TOP_FORM: Form = {
+    "name": tables.TEXT,
+    "description": tables.TEXT,
     "seed": tables.PLAIN,
     "rate": tables.HERTZ,
     "duration": tables.SECONDS,
     "gravity_f": tables.METRES_PER_SECOND_SQUARED,
 }
-_TOP = ("name", "description", *tables.keys(TOP_FORM), "motion", "gyro", "temperature", "sensors")
+_PARTS = ("motion", "gyro", "temperature", "sensors")
 TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CELSIUS, "time_constant": tables.SECONDS}
 
 
@@ -159,35 +161,24 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
             LARGEST_NUMBER < abs(number) <= float(np.finfo(float).max)
         ):  # infinity is valid, as for a time that never comes
             raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
-    known_keys(place, table, _TOP)
-    for key in ("rate_hz", "duration_s", "motion"):
-        if key not in table:
-            raise InputError(f"{place}: {key} is missing; add it")
-    for key in ("name", "description"):
-        if not isinstance(table.get(key, ""), str):
-            raise InputError(f"{place}: {key} is {table[key]!r}; it must be a string")
-    preset, spec = _read_gyro(tables.subtable(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
+    known_keys(place, table, (*tables.keys(TOP_FORM), *_PARTS))
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
         raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
-    values = {
-        "name": table.get("name", ""),
-        "description": table.get("description", ""),
-        "seed": table.get("seed", 0),
-        "rate": table["rate_hz"],
-        "duration": table["duration_s"],
-        "gravity_f": table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
-        "motion": _read_motion(tables.subtable(table["motion"], f"{place}: motion"), f"{place}: motion"),
-        "gyro": spec,
-        "gyro_preset": preset,
-        "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
-    }
+
+    def part(name: str) -> tuple[dict[str, Any], str]:
+        return tables.subtable(table.get(name, {}), f"{place}: {name}"), f"{place}: {name}"
+
+    parts: dict[str, Any] = {}
+    parts["gyro_preset"], parts["gyro"] = _read_gyro(*part("gyro"))
+    if "motion" in table:
+        parts["motion"] = _read_motion(*part("motion"))
     if "temperature" in table:
-        where = f"{place}: temperature"
-        values["temperature"] = tables.build(
-            Temperature, tables.subtable(table["temperature"], where), TEMPERATURE, where
-        )
-    scenario: Scenario = tables.construct(Scenario, values, table, TOP_FORM, place)
+        content, where = part("temperature")
+        parts["temperature"] = tables.build(Temperature, content, TEMPERATURE, where)
+    parts["sensors"] = [_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)]
+    own = {key: value for key, value in table.items() if key not in _PARTS}
+    scenario: Scenario = tables.build(Scenario, own, TOP_FORM, place, **parts)
     if scenario.duration * scenario.rate < 1.0:
         raise InputError(
             f"{place}: {scenario.duration:g} s at {scenario.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
