@@ -7,7 +7,6 @@ time stamps: time begins at 0. :func:`write_broad` writes the same layout and th
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ from strapdown.recordings import recordfiles
 from strapdown.records.recording import Recording, field_in, with_gyro
 
 
-def read_broad(path: str | os.PathLike[str]) -> Recording:
+def read_broad(path: Path) -> Recording:
     """Read a trial of the BROAD data set (Laidig et al. 2021): ``imu_gyr``, ``imu_acc``, ``imu_mag``, ``opt_quat``, ``movement``."""
-    name = Path(path).name
+    name = path.name
     with reading.hdf5(path) as file:
         held = reading.attributes(file)
         kind = str(held.get("kind", ""))
@@ -71,7 +70,7 @@ def sample_interval(source: str, time: Array) -> float:
     return mean
 
 
-def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
+def write_broad(recording: Recording, path: Path) -> None:
     """Write a recording with equal sample intervals in the layout of BROAD, which has no clock."""
     interval = sample_interval(recording.source, recording.time)
     content = {key: getattr(recording, field) for key, field in _FIELDS.items()}

@@ -120,37 +120,37 @@ def unit_of(group: str, text: str) -> str:
 
 def recording(
     source: str,
-    header: Sequence[str],
+    names: Sequence[str],
     load: Callable[[Sequence[int], int], Mapping[int, Array]],
     clock_ns: Callable[[int, str], NDArray[np.int64] | None],
     *,
     units: Mapping[str, str] | None = None,
-    mapping: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
     gyro_alone: bool = False,
 ) -> Recording:
-    """Return the recording of a table.
+    """Return the recording of a table with these names of columns.
 
     ``load`` returns the numbers (n,) of columns, empty fields NaN, from their indices and that of the time, and is called once.
     ``clock_ns`` returns the stamps of a loaded column, of the unit that is declared, if it has dates or integers that count ns from 1970;
-    otherwise None. ``units`` are used if the header declares none. ``mapping`` gives columns by role, optionally with a unit,
+    otherwise None. ``units`` are used if the header declares none. ``columns`` gives columns by role, optionally with a unit,
     ``{"gx": "gyro_x [dps]"}``; the others are found by their names.
     """
-    units, mapping = units or {}, mapping or {}
-    for name, value in (("units", units), ("columns", mapping)):
+    units, columns = units or {}, columns or {}
+    for name, value in (("units", units), ("columns", columns)):
         instance(name, value, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units, [group for group in UNITS if group != "temperature"])
-    columns = [column(cell) for cell in header]
-    names = Counter(column.name.lower() for column in columns if column.name)
-    if twice := [name for name, number in names.items() if number > 1]:
+    header = [column(cell) for cell in names]
+    counts = Counter(column.name.lower() for column in header if column.name)
+    if twice := [name for name, number in counts.items() if number > 1]:
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
-    roles, declared, remark = _roles(source, columns, mapping)
+    roles, declared, remark = _roles(source, header, columns)
     if gyro_alone:
         roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
     for group, members in GROUPS.items():
         missing = [role for role in members if role not in roles]
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
             raise InputError(
-                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in columns)}); "
+                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in header)}); "
                 f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
             )
     present = {_group(role) for role in roles}
@@ -163,7 +163,7 @@ def recording(
     else:
         time, epoch = relative_time(stamps)
     if "time" not in declared and not units.get("time"):
-        _need_time_unit(source, columns[roles["time"]].name, time)
+        _need_time_unit(source, header[roles["time"]].name, time)
     fields: dict[str, Any] = {}
     for group in FIELDS.keys() & present:
         factor = UNITS[group][unit_of_group[group]] if group in ("gyro", "accelerometer") else 1.0

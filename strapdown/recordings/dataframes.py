@@ -7,7 +7,6 @@ they are converted to ns since 1970, UTC. Missing values are missing samples. Ax
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,19 +18,12 @@ from strapdown.checks import Array, InputError, numbers
 from strapdown.files import atomic_write, reading
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
-from strapdown.recordings.delimited import recording_columns, write_columns
+from strapdown.recordings.delimited import write_columns
 from strapdown.records import Estimate
-from strapdown.records.recording import CLOCK_OFFSET, Recording
+from strapdown.records.recording import CLOCK_OFFSET, FIELDS, Recording
 
 
-def from_table(
-    table: Any,
-    *,
-    source: str = "table",
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
-) -> Recording:
+def from_table(table: Any, *, source: str = "table", **options: Any) -> Recording:
     """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
     ``source`` is its name in messages; options as for :func:`strapdown.read`.
@@ -59,15 +51,8 @@ def from_table(
         large = x.dtype.kind in "iu" and unit in ("", "ns") and len(x) and abs(int(x[0])) > CLOCK_OFFSET * 1e9
         return x.astype(np.int64) if large else None
 
-    return naming.recording(
-        source,
-        names,
-        lambda places, time: {k: values(k, time) for k in places},
-        clock_ns,
-        units=units,
-        mapping=columns,
-        gyro_alone=gyro_alone,
-    )
+    load = lambda places, time: {k: values(k, time) for k in places}  # noqa: E731
+    return naming.recording(source, names, load, clock_ns, **options)
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
@@ -143,22 +128,15 @@ def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
     return {name: values for name, values in columns.items() if len(values) == length}
 
 
-def read_parquet(
-    path: str | os.PathLike[str],
-    *,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
-) -> Recording:
+def read_parquet(file: Path, **options: Any) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
-    file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     with parquet.ParquetFile(file, page_checksum_verification=True) as content:
         schema, rows = content.schema_arrow, content.metadata.num_rows
         flat = [k for k, entry in enumerate(schema) if _is_number(entry.type)]
         reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
-    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+    return from_table(_of_arrow(table), source=file.name, **options)
 
 
 def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:
@@ -176,20 +154,25 @@ def _is_number(kind: Any) -> bool:
     return bool(types.is_primitive(kind) or types.is_null(kind))
 
 
-def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as Parquet, with its units as metadata of the fields."""
-    write_parquet_columns(path, *recording_columns(recording))
+def write_recording(recording: Recording, path: Path) -> None:
+    """Write a recording as Parquet or text, by the extension, so that reading it gives the same numbers."""
+    _write(path, *_columns_of(recording))
 
 
-def write_parquet_columns(
-    path: str | os.PathLike[str], columns: Mapping[str, NDArray[np.generic]], units: Mapping[str, str] | None = None
-) -> None:
-    """Write columns as Parquet, with units as metadata of the fields."""
-    arrow = library("pyarrow", f"writing {Path(path).name}")
-    parquet = library("pyarrow.parquet", f"writing {Path(path).name}")
+def write_estimate(estimate: Estimate, path: Path, *, recording: Recording | None, **options: Any) -> None:
+    """Write an estimate as Parquet or text, by the extension; options as for :meth:`strapdown.records.Estimate.table`."""
+    _write(path, estimate.table(recording=recording, **options), {})
+
+
+def _write(path: Path, columns: Mapping[str, NDArray[np.generic]], units: Mapping[str, str]) -> None:
+    """Write columns as text, or as Parquet with units as metadata of the fields."""
+    if path.suffix.lower() != ".parquet":
+        write_columns(path, columns, units)
+        return
+    arrow, parquet = (library(name, f"writing {path.name}") for name in ("pyarrow", "pyarrow.parquet"))
     arrays = [arrow.array(np.ascontiguousarray(values)) for values in columns.values()]
     fields = [
-        arrow.field(name, values.type, metadata={"unit": unit} if (unit := (units or {}).get(name)) else None)
+        arrow.field(name, values.type, metadata={"unit": unit} if (unit := units.get(name)) else None)
         for name, values in zip(columns, arrays, strict=True)
     ]
     with atomic_write(path) as temporary:
@@ -197,9 +180,15 @@ def write_parquet_columns(
         parquet.write_table(table, temporary, write_page_checksum=True)
 
 
-def write_estimate(
-    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
-) -> None:
-    """Write an estimate as Parquet or text, by the suffix; options as for :meth:`strapdown.records.Estimate.table`."""
-    write = write_parquet_columns if Path(path).suffix.lower() == ".parquet" else write_columns
-    write(path, estimate.table(recording=recording, **options))
+def _columns_of(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
+    """Return the data of a recording as columns by the package's names, and the units of the columns that have one."""
+    clock = bool(recording.epoch_ns)
+    columns: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
+    unit = {"time": "ns" if clock else "s"}
+    units = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": recording.magnetic_unit, "temperature": "degC"}
+    for group in recording.parts:
+        values, roles = getattr(recording, FIELDS[group]), naming.GROUPS[group]
+        values = values.astype(np.int64) if group == "movement" else values
+        columns |= dict(zip(roles, values.reshape(len(values), -1).T, strict=True))
+        unit |= dict.fromkeys(roles, units[group]) if units.get(group) else {}
+    return columns, unit

@@ -7,8 +7,8 @@ accepted. Roles of the columns: :mod:`strapdown.recordings.columns`. Axes, units
 are read as integers, so that nanoseconds since 1970 keep all their digits. A time may be an ISO 8601 date, to the microsecond, UTC unless
 it has a time zone.
 
-:func:`write_csv` writes the package's names with units in brackets and 17 digits per number; time is in ns of the source's clock if that
-counts from 1970, else in s.
+:func:`write_columns` writes the package's names with units in brackets and 17 digits per number; time is in ns of the source's clock if
+that counts from 1970, else in s.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import csv
 import datetime
 import io
 import math
-import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,31 +28,22 @@ from numpy.typing import NDArray
 from strapdown.checks import Array, InputError
 from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
-from strapdown.records.recording import CLOCK_OFFSET, FIELDS, Recording
+from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"
 _LARGE = 10**15
 """Integers above this may lose digits as float64."""
 
 
-def read_csv(
-    path: str | os.PathLike[str],
-    *,
-    units: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
-    columns: Mapping[str, str] | None = None,
-) -> Recording:
+def read_csv(file: Path, **options: Any) -> Recording:
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
     left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
     :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
-    file = Path(path)
     table = Table(file.name, io.StringIO(reading.text(file), newline=""))
-    return naming.recording(
-        file.name, table.header, table.load, table.clock_ns, units=units, mapping=columns, gyro_alone=gyro_alone
-    )
+    return naming.recording(file.name, table.header, table.load, table.clock_ns, **options)
 
 
 class Table:
@@ -195,30 +186,13 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
-    """Return the data of a recording as columns by the package's names, and the units of the columns that have one."""
-    clock = bool(recording.epoch_ns)
-    columns: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
-    unit = {"time": "ns" if clock else "s"}
-    units = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": recording.magnetic_unit, "temperature": "degC"}
-    for group in recording.parts:
-        values, roles = getattr(recording, FIELDS[group]), naming.GROUPS[group]
-        values = values.astype(np.int64) if group == "movement" else values
-        columns |= dict(zip(roles, values.reshape(len(values), -1).T, strict=True))
-        unit |= dict.fromkeys(roles, units[group]) if units.get(group) else {}
-    return columns, unit
+def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], units: Mapping[str, str]) -> None:
+    """Write columns of numbers as text, with 17 digits per number, integers as integers; NaN is an empty field.
 
-
-def write_csv(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as CSV (as TSV if the extension is ``.tsv``), so that :func:`read_csv` gives the same numbers."""
-    columns, unit = recording_columns(recording)
-    names = [f"{name} [{unit[name]}]" if name in unit else name for name in columns]
-    write_columns(path, dict(zip(names, columns.values(), strict=True)))
-
-
-def write_columns(path: str | os.PathLike[str], columns: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write columns of numbers as text, with 17 digits per number, integers as integers; NaN is an empty field."""
-    separator = "\t" if Path(path).suffix.lower() == ".tsv" else ","
+    Units are in brackets behind the names. If the extension is ``.tsv``, the separator is a tab.
+    """
+    names = [f"{name} [{units[name]}]" if name in units else name for name in columns]
+    separator = "\t" if path.suffix.lower() == ".tsv" else ","
     texts = []
     for column in columns.values():
         if column.dtype.kind in "iu":
@@ -226,5 +200,5 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, NDArray[np
         else:
             texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
-        file.write(separator.join(columns) + "\n")
+        file.write(separator.join(names) + "\n")
         file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

@@ -15,7 +15,6 @@ The messages have a fixed layout after the name of their frame, so they are deco
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
@@ -125,9 +124,8 @@ class Topic:
 # ----------------------------------------------------------------------------------------------------------- reading
 
 
-def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
+def read_bag(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
-    file = Path(path)
     topics, _, remarks = topics_of(file, READ)
     topic_name = chosen(file.name, topics, topic, "inertial units", [IMU]).name
     stamps, values, order_words = topics[topic_name].decoded(file.name)
@@ -256,23 +254,22 @@ def topics_of(path: Path, spans: Mapping[str, tuple[int, int]]) -> tuple[dict[st
 # ----------------------------------------------------------------------------------------------------------- writing
 
 
-def write_bag(recording: Recording, path: str | os.PathLike[str]) -> None:
+def write_bag(recording: Recording, target: Path) -> None:
     """Write a recording as a bag in one file: ``.bag`` ROS 1, ``.mcap`` and ``.db3`` ROS 2.
 
     Missing samples are not written; the unit of the magnetometer must be known.
     """
-    _write(Path(path), _series(recording, None))
+    _write(target, _series(recording, None))
 
 
 def write_estimate(
-    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, source: Path | None = None
+    estimate: Estimate, target: Path, *, recording: Recording | None, source: Path | None = None
 ) -> None:
     """Write the samples that an estimate was made from as a bag, with the estimated orientation and its covariance.
 
     All other topics of ``source``, the bag that the recording was read from, are copied unchanged if it is of the same ROS version.
     """
     assert recording is not None
-    target = Path(path)
     series = _series(recording, estimate)
     others: list[Topic] = []
     bag = None

@@ -8,7 +8,6 @@ accelerometer, depend on the device: check them with ``strapdown doctor``. The c
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,8 @@ def is_log(head: bytes) -> bool:
     return head.startswith(tuple(_BEGINNINGS)) or head[4:8] == b"ftyp"
 
 
-def read_telemetry(path: str | os.PathLike[str]) -> Recording:
+def read_telemetry(file: Path) -> Recording:
     """Read the inertial unit of a camera's, flight controller's or phone's log."""
-    file = Path(path)
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
     with tempfile.TemporaryDirectory() as folder:
         named, ending = file, _ending(file)

@@ -42,9 +42,8 @@ def is_folder(path: Path) -> bool:
     return path.is_dir() and _root(path) is not None
 
 
-def read_euroc(path: str | os.PathLike[str]) -> Recording:
+def read_euroc(folder: Path) -> Recording:
     """Read a folder of EuRoC or TUM-VI: the inertial unit, and the ground truth if there is one."""
-    folder = Path(path)
     root = _root(folder)
     assert root is not None  # by which its format was recognised
     recording = replace(read_csv(root / "imu0" / "data.csv"), source=folder.name, remarks=("EuRoC layout, imu0.",))
@@ -128,9 +127,7 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
     return replace(recording, true_attitude=reference, remarks=(*recording.remarks, words))
 
 
-def write_tum(
-    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, frame: str = "ENU"
-) -> None:
+def write_tum(estimate: Estimate, path: Path, *, recording: Recording | None, frame: str = "ENU") -> None:
     """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
     table = estimate.table(frame=frame)
     q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)

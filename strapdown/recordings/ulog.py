@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,9 +41,8 @@ LATE = 0.5
 """Minimum time offset of the accelerometer, in sample intervals, that is reported."""
 
 
-def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
+def read_ulog(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a flight log."""
-    file = Path(path)
     log = opened(file, [UNIT, FIELD, ATTITUDE, TRUTH])
     data = {
         dataset.name if dataset.multi_id == 0 else f"{dataset.name}:{dataset.multi_id}": dataset.data
