@@ -28,6 +28,7 @@ from strapdown.checks import Array, Hint, InputError, array
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, Recording, outputs
+from strapdown.records.estimate import STATES
 from strapdown.records.recording import TIME_UNITS
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
@@ -203,8 +204,6 @@ COLUMNS: dict[str, str] = {
 attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one with its axes named; ``sigma_x_deg`` and
 ``yaw_sigma_deg`` are standard deviations, of the rotation vector or of the angles."""
 _SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
-_STATES = ("x", "y", "z", "bx", "by", "bz")
-_PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
 
 
 def _table(path: Path) -> Attitudes:
@@ -213,8 +212,8 @@ def _table(path: Path) -> Attitudes:
     named: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
     frames: set[str] = set()
     for place, cell in enumerate(table.header):
-        for name, pattern in _PATTERNS.items():
-            match = pattern.fullmatch(cell.strip().lower())
+        for name, pattern in COLUMNS.items():
+            match = re.fullmatch(pattern, cell.strip().lower())
             if match is None:
                 continue
             parts = match.groupdict()
@@ -287,11 +286,11 @@ def _covariance(
         size = 6 if any("b" in key for key in cov_columns) else 3
         P = np.full((m, size, size), np.nan)
         for key, (value, unit) in cov_columns.items():
-            i, j = (_STATES.index(state) for state in key.split())
+            i, j = (STATES.index(state) for state in key.split())
             P[:, i, j] = P[:, j, i] = value * (DEGREE**2 if unit == "deg2" else 1.0)
         if np.isnan(P).any(axis=0).any():
             i, j = np.argwhere(np.isnan(P).any(axis=0))[0]
-            raise InputError(f"{name}: cov_{_STATES[i]}{_STATES[j]} is missing, or empty in a row; give all elements")
+            raise InputError(f"{name}: cov_{STATES[i]}{STATES[j]} is missing, or empty in a row; give all elements")
         return P, "", []
     for group, axes, frame in (("sigma", "xyz", ""), ("angle", ("roll", "pitch", "yaw"), "euler")):
         entries = columns[group]

@@ -45,18 +45,18 @@ def read_telemetry(file: Path) -> Recording:
             named.symlink_to(file.absolute())
         log = parser.Parser(str(named))
         rows: list[dict[str, Any]] = log.normalized_imu()
-    if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
+    rate, force, field = (_samples(rows, name) for name in ("gyro", "accl", "magn"))
+    if len(rows) < 2 or rate is None:
         raise InputError(
             f"{file.name} ({log.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"
         )
     time = np.array([row["timestamp_ms"] for row in rows], np.float64) / 1e3
     device = " ".join(part for part in (log.camera, log.model) if part)
-    field = _columns(rows, "magn")
     return with_gyro(
         source=file.name,
         time=time,
-        rate=np.asarray(_triples(rows, "gyro") * DEGREE),
-        specific_force=_columns(rows, "accl"),
+        rate=rate * DEGREE,
+        specific_force=force,
         magnetic_field=field,
         magnetic_unit="" if field is None else "uT",
         remarks=(f"Device: {device}. Its axes are those of telemetry-parser; check them with `strapdown doctor`.",),
@@ -72,11 +72,7 @@ def _ending(file: Path) -> str:
     return next((ending for begin, ending in _BEGINNINGS.items() if head.startswith(begin)), ".mp4")
 
 
-def _triples(rows: list[dict[str, Any]], name: str) -> Array:
-    return np.array([row[name] if row.get(name) is not None else (np.nan,) * 3 for row in rows], np.float64)
-
-
-def _columns(rows: list[dict[str, Any]], name: str) -> Array | None:
+def _samples(rows: list[dict[str, Any]], name: str) -> Array | None:
     """Return a sensor's samples; None if there are none."""
-    triples = _triples(rows, name)
-    return None if np.isnan(triples).all() else triples
+    samples = np.array([row[name] if row.get(name) is not None else (np.nan,) * 3 for row in rows], np.float64)
+    return None if np.isnan(samples).all() else samples

@@ -64,11 +64,9 @@ def read_ulog(file: Path, *, topic: str) -> Recording:
     time, epoch = relative_time(stamps * 1000)
     rows = data[topic_name]
     rate = columns(rows, "gyro_rad", 3)[order]
-    force = columns(rows, "accelerometer_m_s2", 3)[order]
-    relative = np.asarray(rows.get("accelerometer_timestamp_relative", np.zeros(len(order))))[order]
-    force[relative == NO_SAMPLE] = np.nan
+    force, offsets = _samples(rows, "accelerometer_m_s2", order)
     usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    late = float(np.median(relative[relative != NO_SAMPLE])) if np.any(relative != NO_SAMPLE) else 0.0
+    late = float(np.median(offsets)) if len(offsets) else 0.0
     if abs(late) > LATE * usual:
         remarks.append(
             f"The accelerometer's samples are offset by {1e-3 * late:.3g} ms from the gyro's stamps, which is not corrected."
@@ -80,11 +78,7 @@ def read_ulog(file: Path, *, topic: str) -> Recording:
         own["magnetic_field"], remark = beside(FIELD, at * 1000, samples, time, epoch)
         remarks += [remark, *words]
     elif "magnetometer_ga[0]" in rows:
-        field = columns(rows, "magnetometer_ga", 3)[order]
-        field[np.asarray(rows.get("magnetometer_timestamp_relative", np.zeros(len(order))))[order] == NO_SAMPLE] = (
-            np.nan
-        )
-        own["magnetic_field"] = field
+        own["magnetic_field"], _ = _samples(rows, "magnetometer_ga", order)
     own["magnetic_unit"] = "G" if "magnetic_field" in own else ""
     reference = next((name for name in (TRUTH, ATTITUDE) if name in data and len(data[name]["timestamp"]) > 1), None)
     if reference is not None:
@@ -181,6 +175,15 @@ def columns(rows: dict[str, Any], name: str, size: int) -> Array:
     if missing := [f"{name}[{k}]" for k in range(size) if f"{name}[{k}]" not in rows]:
         raise InputError(f"a message has no field {missing[0]} (it has: {', '.join(rows)}); the log is damaged")
     return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
+
+
+def _samples(rows: dict[str, Any], name: str, order: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the samples of a sensor in the messages of the gyro, NaN where there is no new one, and the time offsets of the others, µs."""
+    samples = columns(rows, name, 3)[order]
+    none = np.zeros_like(rows["timestamp"], np.int64)
+    offsets = np.asarray(rows.get(f"{name.partition('_')[0]}_timestamp_relative", none))[order]
+    samples[offsets == NO_SAMPLE] = np.nan
+    return samples, offsets[offsets != NO_SAMPLE]
 
 
 def in_order(topic: str, timestamp: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:

@@ -503,7 +503,7 @@ class Estimate(ByValue, Listed):
             size = 6 if np.isfinite(self.covariance[:, 3:, 3:]).any() else 3
             for i, j in itertools.combinations_with_replacement(range(size), 2):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
-                columns[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = self.covariance[:, i, j]
+                columns[f"cov_body_{STATES[i]}{STATES[j]}_{unit}"] = self.covariance[:, i, j]
         if recording is not None:
             rows = recording.rows_of(self.time)
             rate = recording.rate[rows] - (self.bias if self.has_bias else 0.0)
@@ -532,4 +532,5 @@ class Estimate(ByValue, Listed):
 
 _NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 """Names of the angles of a sequence of three different axes."""
-_STATES = ("x", "y", "z", "bx", "by", "bz")
+STATES = ("x", "y", "z", "bx", "by", "bz")
+"""Names of the components of the error state."""
