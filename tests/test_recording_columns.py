@@ -1,14 +1,11 @@
 """Which column of a table is what: mapped, guessed and said, or refused."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from measured import walk
 from typer.testing import CliRunner
 
-from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import delimited, read
@@ -223,18 +220,6 @@ def test_temperature_goes_along(table):
     np.testing.assert_array_equal(recording.temperature, VALUES[:, 4])
     guessed = read(table("time,gx [rad/s],gy,gz,temp_C,a1,a2,mx,my,mz"))
     np.testing.assert_array_equal(guessed.temperature, VALUES[:, 4])
-
-
-def test_what_is_written_is_read_back_to_the_bit(tmp_path):
-    whole = replace(walk(), magnetic_unit="mG")
-    for ending in ("csv", "tsv"):
-        recordings.write(whole, tmp_path / f"x.{ending}")
-        back = read(tmp_path / f"x.{ending}")
-        assert back.remarks == ()
-        assert back.clock_ns.tolist() == whole.clock_ns.tolist()
-        for name in ("rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement"):
-            np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
-        assert back.magnetic_unit == "mG"
 
 
 def test_the_xio_recording_is_understood(xio):

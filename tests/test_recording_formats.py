@@ -4,7 +4,6 @@ import sys
 import types
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 from measured import walk
@@ -18,7 +17,6 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, formats, read, trajectories
 from strapdown.recordings.attitudes import read_attitudes
-from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
 MISSING = "is not installed: pip install 'strapdown[formats]'"
@@ -35,19 +33,13 @@ ALL = ("rate", "specific_force", "magnetic_field", "temperature", "true_attitude
 # --------------------------------------------------------------------------------------------- columns in memory, Parquet
 
 
-@pytest.mark.parametrize("epoch", [0, START])
-def test_parquet_comes_back_to_the_bit(tmp_path, epoch):
+def test_a_truncated_parquet_is_refused(tmp_path):
     pytest.importorskip("pyarrow", reason=f"pyarrow {MISSING}")
-    whole = walk(epoch=epoch)
-    recordings.write(whole, tmp_path / "x.parquet")
-    back = read(tmp_path / "x.parquet")
-    same(back, whole, *ALL)
-    assert back.magnetic_unit == "G"
-    assert back.remarks == ()
-    cut = tmp_path / "cut.parquet"
-    cut.write_bytes((tmp_path / "x.parquet").read_bytes()[:500])
+    path = tmp_path / "cut.parquet"
+    recordings.write(walk(), path)
+    path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match=r"cut.parquet cannot be read as Parquet .* truncated"):
-        read(cut)
+        read(path)
 
 
 def test_parquet_of_pandas_is_read(tmp_path):
@@ -207,15 +199,15 @@ def test_the_end_of_a_long_flight_log_shows_whether_it_is_whole(ulog, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("module", "ending"), [("pyulog", "ulg"), ("pyarrow.parquet", "parquet")], ids=["pyulog", "pyarrow"]
+    ("module", "ending"), [("pyulog", "ulg"), ("pyarrow.parquet", "parquet"), ("rosbags.typesys", "mcap")]
 )
 def test_a_missing_library_is_named_with_its_remedy(tmp_path, monkeypatch, module, ending):
     pytest.importorskip(module, reason=f"{module} {MISSING}")
-    write = write_ulog if ending == "ulg" else recordings.write
-    write(walk(single=True), tmp_path / f"x.{ending}")
+    path, write = tmp_path / f"x.{ending}", write_ulog if ending == "ulg" else recordings.write
+    write(walk(single=True), path)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=rf"needs {module.partition('.')[0]} .*pip install 'strapdown\[formats\]'"):
-        read(tmp_path / f"x.{ending}")
+        write(walk(), path) if ending == "mcap" else read(path)  # bags are read without it
 
 
 # --------------------------------------------------------------------------------------------- cameras and flight controllers
@@ -394,6 +386,23 @@ def convert(*arguments) -> tuple[int, str]:
 ROUND = ("csv", "tsv", "parquet", "bag", "mcap", "db3")
 
 
+@pytest.mark.parametrize("ending", ROUND)
+@pytest.mark.parametrize("epoch", [0, START])
+def test_what_is_written_comes_back_to_the_bit(tmp_path, ending, epoch):
+    needed = {"bag": "rosbags", "mcap": "rosbags", "db3": "rosbags", "parquet": "pyarrow"}.get(ending, "")
+    whole = replace(walk(epoch=epoch), magnetic_unit="mG")
+    if needed:
+        pytest.importorskip(needed, reason=f"{needed} {MISSING}")
+    if needed == "rosbags":  # a bag has a field in T, and no movement
+        whole = replace(whole, magnetic_unit="T", movement=None)
+    recordings.write(whole, tmp_path / f"x.{ending}")
+    back = read(tmp_path / f"x.{ending}")
+    same(back, whole, *(name for name in ALL if getattr(whole, name) is not None))
+    assert (back.parts, back.magnetic_unit) == (whole.parts, whole.magnetic_unit)
+    assert back.remarks == () or needed == "rosbags"
+    assert [path.name for path in tmp_path.iterdir()] == [f"x.{ending}"]
+
+
 @pytest.mark.parametrize(("first", "second"), [*zip(ROUND, ROUND), *zip(ROUND, (*ROUND[1:], ROUND[0]))])  # noqa: B905
 def test_from_each_to_itself_and_the_next_and_back_loses_nothing_that_both_hold(tmp_path, first, second):
     for name in ("rosbags", "pyarrow"):
@@ -478,10 +487,3 @@ def test_a_trajectory_goes_along_as_reference(tmp_path):
     status, said = convert(tmp_path / "a.csv", tmp_path / "b.csv", "--reference", tmp_path / "t.tum")
     assert status == 0, said
     np.testing.assert_allclose(np.abs(read(tmp_path / "b.csv").true_attitude[:, 0]), 1.0)
-
-
-def test_estimates_of_another_layout_are_not_taken_for_recordings(tmp_path):
-    with h5py.File(tmp_path / "x.h5", "w") as file:
-        file.attrs["kind"] = "strapdown tuning"
-    assert convert(tmp_path / "x.h5", tmp_path / "x.csv")[0] == 1
-    assert outputs.FRAMES == ("ENU", "NED")
