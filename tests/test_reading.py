@@ -51,6 +51,7 @@ KINDS += ("filter.toml", "gyro.toml", "dispersions.toml", "vibration.csv", "tuni
 def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
     """A pipe that nobody writes to would block for ever, /dev/zero never end."""
     path, begun = tmp_path / name, time.process_time()  # a pipe would hold the test itself
+    held = len(os.listdir("/dev/fd"))
     with pytest.raises(InputError, match=rf"{name}.*does not exist"):
         known[name].read(path)
     path.mkdir()
@@ -69,6 +70,7 @@ def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
     with pytest.raises(InputError, match=rf"{name}"):
         known[name].read(path)
     assert time.process_time() - begun < 2.0
+    assert len(os.listdir("/dev/fd")) == held
 
 
 def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):

@@ -191,19 +191,16 @@ def opened(path: Name, *, link: bool = True, maximum: int | None = None) -> Iter
         raise InputError(f"{path} is a symbolic link, which is not followed here; put the file itself there")
     try:
         # Non-blocking, so that a pipe without a writer is opened and then rejected.
-        handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
+        opener = lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # noqa: E731
+        handle = open(path, "rb", opener=opener)  # noqa: SIM115
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder; name the file in it") from None
     except (OSError, ValueError) as error:
-        if Path(path).is_dir():  # on Windows, opening a folder fails like a file without permission
+        if Path(path).is_dir():
             raise InputError(f"{path} is a folder; name the file in it") from None
         raise InputError(f"{path} cannot be read ({error}); check the path and its permissions") from None
     with handle:
         status = os.fstat(handle.fileno())
-        if stat.S_ISDIR(status.st_mode):
-            raise InputError(f"{path} is a folder; name the file in it")
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path} is not a regular file but a pipe or a device; write its content to a file first")
         _need_size(path, status.st_size, maximum)

@@ -270,12 +270,10 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
 
 def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
     """Return a column's name without its axis, the axis, and the unit in the name; None if it is not an axis of that sensor."""
-    words = _words(name)
-    joined = re.fullmatch(r"([a-z]+)([xyz])", words[-1]) if words else None
-    if joined and joined[1] in _WORDS[group]:
-        words = [*words[:-1], joined[1], joined[2]]
-    elif words and (first := re.fullmatch(r"([a-z]+)([xyz])", words[0])) and first[1] in _WORDS[group]:
-        words = [first[1], first[2], *words[1:]]
+    words: list[str] = []
+    for word in _words(name):
+        joined = re.fullmatch(r"([a-z]+)([xyz])", word)
+        words += joined.groups() if joined and joined[1] in _WORDS[group] else [word]
     places = [k for k, word in enumerate(words) if word in ("x", "y", "z", "axis0", "axis1", "axis2")]
     if not places:
         return None

@@ -135,5 +135,4 @@ def write_tum(estimate: Estimate, path: Path, *, recording: Recording | None, fr
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write("# time tx ty tz qx qy qz qw\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
-            sign, size = "-" if stamp < 0 else "", abs(stamp)
-            file.write(f"{sign}{size // 10**9}.{size % 10**9:09d} 0 0 0 {' '.join(map(repr, row))}\n")
+            file.write(f"{Decimal(stamp).scaleb(-9):f} 0 0 0 {' '.join(map(repr, row))}\n")
