@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Mapping
@@ -208,7 +207,7 @@ _SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HO
 
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
-    table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
+    table = delimited.Table(path)
     named: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
     frames: set[str] = set()
     for place, cell in enumerate(table.header):

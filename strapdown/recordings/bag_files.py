@@ -14,6 +14,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -95,23 +96,23 @@ def _unwanted(logged: int, data: Data) -> None:
     pass
 
 
+@dataclass
 class _Scan:
     """The scan of one file."""
 
-    def __init__(
-        self, bag: Bag, file: Path, unpacked: reading.Unpacked, receiver: Callable[[str, str], Add | None]
-    ) -> None:
-        self.bag = bag
-        self.path = file
-        self.unpacked = unpacked
-        self.receiver = receiver
-        self.topics: dict[Any, Add] = {}
-        """By number of the connection, channel or topic."""
-        self.schemas: dict[int, str] = {}
-        self.number = self.lost = 0
-        """Number of messages, and of those of no topic."""
-        self.checked = False
-        """Whether the chunks of an MCAP file have checksums."""
+    bag: Bag
+    path: Path
+    unpacked: reading.Unpacked
+    receiver: Callable[[str, str], Add | None]
+    topics: dict[Any, Add] = field(default_factory=dict)
+    """By number of the connection, channel or topic."""
+    schemas: dict[int, str] = field(default_factory=dict)
+    number: int = 0
+    """Number of messages."""
+    lost: int = 0
+    """Number of those of no topic."""
+    checked: bool = False
+    """Whether the chunks of an MCAP file have checksums."""
 
     @contextlib.contextmanager
     def guarded(self, place: int) -> Iterator[None]:

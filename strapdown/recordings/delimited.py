@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,19 +43,21 @@ def read_csv(file: Path, **options: Any) -> Recording:
     left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
     :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
-    table = Table(file.name, io.StringIO(reading.text(file), newline=""))
+    table = Table(file)
     return naming.recording(file.name, table.header, table.load, table.clock_ns, **options)
 
 
 class Table:
     """A header and rows of numbers; only the requested columns are read, the others may have any content."""
 
-    def __init__(self, source: str, lines: Iterator[str]) -> None:
-        self.source = source
-        self.header, self._separator, first = _head(source, lines)
+    def __init__(self, file: Path) -> None:
+        self.source = file.name
+        lines = io.StringIO(reading.text(file), newline="")
+        self.header, self._separator, first = _head(self.source, lines)
         self._whole: dict[int, list[int]] = {}  # columns of large integers
         self._rows_read = 0
-        self._rows = csv.reader(_rest(first, lines), delimiter=self._separator)
+        rest = (line for line in lines if line.strip() and not line.lstrip().startswith("#"))
+        self._rows = csv.reader(itertools.chain(first, rest), delimiter=self._separator)
 
     def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
         """Return the numbers (n,) of columns; empty fields are NaN, dates in the time column are ns since 1970."""
@@ -149,13 +152,6 @@ def _date(cell: str) -> int | None:
         1970, 1, 1, tzinfo=datetime.UTC
     )
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
-
-
-def _rest(first: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
-    yield from first
-    for line in lines:
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield line
 
 
 def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:

@@ -162,9 +162,6 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         ):  # infinity is valid, as for a time that never comes
             raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
     known_keys(place, table, (*tables.keys(TOP_FORM), *_PARTS))
-    sensors = table.get("sensors", [])
-    if not isinstance(sensors, list):
-        raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
 
     def part(name: str) -> tuple[dict[str, Any], str]:
         return tables.subtable(table.get(name, {}), f"{place}: {name}"), f"{place}: {name}"
@@ -176,7 +173,7 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
     if "temperature" in table:
         content, where = part("temperature")
         parts["temperature"] = tables.build(Temperature, content, TEMPERATURE, where)
-    parts["sensors"] = [_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)]
+    parts["sensors"] = [_read_sensor(*entry) for entry in _entries(table.get("sensors", []), "sensors", place)]
     own = {key: value for key, value in table.items() if key not in _PARTS}
     scenario: Scenario = tables.build(Scenario, own, TOP_FORM, place, **parts)
     if scenario.duration * scenario.rate < 1.0:
@@ -190,6 +187,15 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
                 f"{place}: {sensor.name} would measure {number:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or the duration"
             )
     return scenario
+
+
+def _entries(content: Any, header: str, place: str) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield each table of a list in a file, with its place."""
+    name = header.rpartition(".")[2]
+    if not isinstance(content, list):
+        raise InputError(f"{place}: {name} is one table; write [[{header}]] with two brackets")
+    for i, entry in enumerate(content):
+        yield tables.subtable(entry, f"{place}: {name}[{i}]"), f"{place}: {name}[{i}]"
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -213,15 +219,8 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
     kind, form = MOTIONS[word]
     more: dict[str, Any] = {}
     if kind is motion.HarmonicRates:
-        entries = table.pop("harmonics", [])
-        if not isinstance(entries, list):
-            raise InputError(f"{place}: harmonics is one table; write [[motion.harmonics]] with two brackets")
-        more["harmonics"] = tuple(
-            tables.build(
-                motion.Harmonic, tables.subtable(h, f"{place}: harmonics[{i}]"), HARMONIC, f"{place}: harmonics[{i}]"
-            )
-            for i, h in enumerate(entries)
-        )
+        entries = _entries(table.pop("harmonics", []), "motion.harmonics", place)
+        more["harmonics"] = tuple(tables.build(motion.Harmonic, h, HARMONIC, where) for h, where in entries)
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
 
 
@@ -247,8 +246,7 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
     return ("", gyro.from_table(table, place, spec)) if table else (name, spec)
 
 
-def _read_sensor(entry: Any, place: str) -> Sensor:
-    table = tables.subtable(entry, place)
+def _read_sensor(table: dict[str, Any], place: str) -> Sensor:
     word = _word(table, place, SENSORS)
     kind, form, faults = SENSORS[word]
     orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
