@@ -202,7 +202,8 @@ COLUMNS: dict[str, str] = {
 """Columns of a table by their content: patterns of whole names, in lower case. ``cov_xy_rad2`` is an element of the covariance of the
 attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one with its axes named; ``sigma_x_deg`` and
 ``yaw_sigma_deg`` are standard deviations, of the rotation vector or of the angles."""
-_SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
+_FACTORS = {"deg": DEGREE, "deg2": DEGREE**2, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
+"""Factors to SI of the units in names, unless they are SI."""
 
 
 def _table(path: Path) -> Attitudes:
@@ -238,7 +239,8 @@ def _table(path: Path) -> Attitudes:
     numbers = table.load(places, time_place)
     stamps = table.clock_ns(time_place, "")  # dates, or numbers so large that no other unit makes sense
     columns = {
-        name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in named.items()
+        name: {key: numbers[place] * _FACTORS.get(unit, 1.0) for key, (place, unit) in group.items()}
+        for name, group in named.items()
     }
     if stamps is None:
         tick = round(1e9 * TIME_UNITS[time_unit.replace("sec", "s") or "s"])
@@ -248,13 +250,13 @@ def _table(path: Path) -> Attitudes:
                 f"{path.name}: a time is {numbers[time_place][np.argmax(np.abs(counts))]:g}, which no clock counts"
             )
         stamps = counts.astype(np.int64)
-    q = np.stack([columns["q"][axis][0] for axis in "wxyz"], axis=1)
+    q = np.stack([columns["q"][axis] for axis in "wxyz"], axis=1)
     known = np.isfinite(q).all(axis=1)
     covariance, frame, remarks = _covariance(path.name, columns, len(stamps))
     frame = frame or next(iter(frames), "")
     bias = None
     if set(columns["bias"]) == set("xyz"):
-        bias = np.stack([value * _SIZE[unit] for value, unit in (columns["bias"][axis] for axis in "xyz")], axis=1)
+        bias = np.stack([columns["bias"][axis] for axis in "xyz"], axis=1)
     if covariance is not None and covariance.shape[1] == 6 and bias is None:
         covariance = covariance[:, :3, :3]
     if covariance is not None and covariance.shape[1] == 3:
@@ -276,25 +278,22 @@ def _table(path: Path) -> Attitudes:
     )
 
 
-def _covariance(
-    name: str, columns: Mapping[str, Mapping[str, tuple[Array, str]]], m: int
-) -> tuple[Array | None, str, list[str]]:
+def _covariance(name: str, columns: Mapping[str, Mapping[str, Array]], m: int) -> tuple[Array | None, str, list[str]]:
     """Return the covariance from the columns, the kind of angles it describes (empty if not named), and remarks."""
     cov_columns = columns["cov"]
     if cov_columns:
         size = 6 if any("b" in key for key in cov_columns) else 3
         P = np.full((m, size, size), np.nan)
-        for key, (value, unit) in cov_columns.items():
+        for key, value in cov_columns.items():
             i, j = (STATES.index(state) for state in key.split())
-            P[:, i, j] = P[:, j, i] = value * (DEGREE**2 if unit == "deg2" else 1.0)
+            P[:, i, j] = P[:, j, i] = value
         if np.isnan(P).any(axis=0).any():
             i, j = np.argwhere(np.isnan(P).any(axis=0))[0]
             raise InputError(f"{name}: cov_{STATES[i]}{STATES[j]} is missing, or empty in a row; give all elements")
         return P, "", []
     for group, axes, frame in (("sigma", "xyz", ""), ("angle", ("roll", "pitch", "yaw"), "euler")):
-        entries = columns[group]
-        if set(entries) == set(axes):
-            sigma = np.stack([entries[axis][0] * _SIZE[entries[axis][1]] for axis in axes], axis=1)
+        if set(columns[group]) == set(axes):
+            sigma = np.stack([columns[group][axis] for axis in axes], axis=1)
             words = "The file has σ and no covariance: errors of different axes are treated as independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
     words = (

@@ -85,16 +85,12 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
 
 def _plain(series: Any) -> NDArray[np.generic]:
     """Return a column as an array; dates with a time zone as UTC, missing values of nullable types as NaN."""
+    options: dict[str, Any] = {}
     if getattr(getattr(series, "dt", series), "tz", None) is not None:
-        return np.asarray(series.to_numpy("M8[ns]"))
-    if hasattr(series, "to_numpy"):
-        kind = getattr(series.dtype, "kind", "O")
-        if kind in "iuf" and not isinstance(series.dtype, np.dtype):  # the nullable types of pandas
-            return np.asarray(
-                series.to_numpy(dtype=np.float64, na_value=np.nan) if series.isna().any() else series.to_numpy()
-            )
-        return np.asarray(series.to_numpy())
-    return np.asarray(series)
+        options = {"dtype": "M8[ns]"}
+    elif getattr(series.dtype, "kind", "O") in "iuf" and series.isna().any():
+        options = {"dtype": np.float64, "na_value": np.nan}
+    return np.asarray(series.to_numpy(**options))
 
 
 def _unmasked(values: Any) -> NDArray[np.generic]:
@@ -131,9 +127,11 @@ def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
 def read_parquet(file: Path, **options: Any) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
+    types = library("pyarrow.types", "Parquet")
     with parquet.ParquetFile(file, page_checksum_verification=True) as content:
         schema, rows = content.schema_arrow, content.metadata.num_rows
-        flat = [k for k, entry in enumerate(schema) if _is_number(entry.type)]
+        # Numbers, flags and dates; other columns, which may have any size, are not read.
+        flat = [k for k, column in enumerate(schema) if types.is_primitive(column.type) or types.is_null(column.type)]
         reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
     return from_table(_of_arrow(table), source=file.name, **options)
@@ -146,12 +144,6 @@ def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
         columns[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
     return columns
-
-
-def _is_number(kind: Any) -> bool:
-    """Return whether a column of an Arrow type has numbers, flags or dates; others, which may have any size, are not read."""
-    types = library("pyarrow", "Parquet").types
-    return bool(types.is_primitive(kind) or types.is_null(kind))
 
 
 def write_recording(recording: Recording, path: Path) -> None:
