@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from strapdown.checks import InputError, one_of
 from strapdown.files import reading
-from strapdown.recordings import bag_files, telemetry, trajectories
+from strapdown.recordings import bag_files, broad, dataframes, delimited, ros, telemetry, trajectories, ulog
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord, outputs
 from strapdown.records.recording import Recording, matched, with_gyro
@@ -34,12 +33,12 @@ class Format:
     endings: tuple[str, ...]
     recognised: Callable[[Path, bytes], bool]
     """Whether a file's path and first bytes (none for a folder) are of this format."""
-    read: str = ""
-    """Reader of recordings, ``module:function`` below :mod:`strapdown.recordings`; empty: none."""
-    write: str = ""
-    """Writer of recordings, likewise."""
-    write_estimate: str = ""
-    """Writer of estimates, likewise."""
+    read: Any = None
+    """Function that reads a recording, from its path and ``options``; None: cannot be read."""
+    write: Any = None
+    """Function that writes a recording, from it and a path; None: cannot be written."""
+    write_estimate: Any = None
+    """Function that writes an estimate, likewise, with the keyword ``recording`` and ``estimate_options``."""
     options: tuple[str, ...] = ()
     """Keywords of :func:`read` that the reader accepts."""
     estimate_options: tuple[str, ...] = ()
@@ -70,11 +69,11 @@ FORMATS: tuple[Format, ...] = (
         name="ROS bag",
         endings=(".bag", ".mcap", ".db3"),
         recognised=lambda path, head: bag_files.is_folder(path) or head.startswith(bag_files.MAGICS),
-        read="ros:read_bag",
+        read=ros.read_bag,
         options=("topic",),
-        write="ros:write_bag",
+        write=ros.write_bag,
         lacks=("movement",),
-        write_estimate="ros:write_estimate",
+        write_estimate=ros.write_estimate,
         estimate_options=("source",),
         with_samples=True,
     ),
@@ -82,54 +81,54 @@ FORMATS: tuple[Format, ...] = (
         name="ULog",
         endings=(".ulg",),
         recognised=_starts(b"ULog\x01\x12\x35"),
-        read="ulog:read_ulog",
+        read=ulog.read_ulog,
         options=("topic",),
     ),
     Format(
         name="Parquet",
         endings=(".parquet",),
         recognised=_starts(b"PAR1"),
-        read="dataframes:read_parquet",
+        read=dataframes.read_parquet,
         options=("units", "columns", "gyro_alone"),
-        write="dataframes:write_recording",
-        write_estimate="dataframes:write_estimate",
+        write=dataframes.write_recording,
+        write_estimate=dataframes.write_estimate,
         estimate_options=("sequence", "frame"),
     ),
     Format(
         name="camera or flight log",
         endings=telemetry.ENDINGS,
         recognised=lambda path, head: telemetry.is_log(head),
-        read="telemetry:read_telemetry",
+        read=telemetry.read_telemetry,
     ),
     Format(
         name="EuRoC folder",
         endings=(),
         recognised=lambda path, head: trajectories.is_folder(path),
-        read="trajectories:read_euroc",
+        read=trajectories.read_euroc,
     ),
     Format(
         name="TUM trajectory",
         endings=(".tum",),
         recognised=lambda path, head: _text(head) and trajectories.is_tum(head),
-        write_estimate="trajectories:write_tum",
+        write_estimate=trajectories.write_tum,
         estimate_options=("frame",),
     ),
     Format(
         name="BROAD",
         endings=(".hdf5", ".h5"),
         recognised=_starts(b"\x89HDF\r\n\x1a\n", reading.SEAL),
-        read="broad:read_broad",
-        write="broad:write_broad",
+        read=broad.read_broad,
+        write=broad.write_broad,
         lacks=("temperature", "clock"),
     ),
     Format(
         name="CSV",
         endings=(".csv", ".tsv", ".txt"),
         recognised=lambda path, head: _text(head),
-        read="delimited:read_csv",
+        read=delimited.read_csv,
         options=("units", "columns", "gyro_alone"),
-        write="dataframes:write_recording",
-        write_estimate="dataframes:write_estimate",
+        write=dataframes.write_recording,
+        write_estimate=dataframes.write_estimate,
         estimate_options=("sequence", "frame"),
     ),
 )
@@ -171,12 +170,6 @@ _REASONS = {
 """Why a format has no such option of :func:`read`."""
 
 
-def _function(place: str) -> Callable[..., Any]:
-    module, _, name = place.partition(":")
-    function: Callable[..., Any] = getattr(import_module(f"strapdown.recordings.{module}"), name)
-    return function
-
-
 def read(
     path: str | os.PathLike[str],
     *,
@@ -190,7 +183,7 @@ def read(
     """Read a recording of any format, recognised by its content: a file, or a folder; options as for :func:`strapdown.read`."""
     file = Path(path)
     file_format = format_of(file)
-    if not file_format.read:
+    if file_format.read is None:
         raise InputError(
             f"{file.name} is a {file_format.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
@@ -201,7 +194,7 @@ def read(
             raise InputError(f"{file.name} ({file_format.name}): {reason}; drop the option{which}")
     options = {name: value for name, value in options.items() if name in file_format.options}
     with reading.from_file(file, file_format.name):
-        recording: Recording = _function(file_format.read)(file, **options)
+        recording: Recording = file_format.read(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
 
 
@@ -221,9 +214,9 @@ def write(
         content = from_record(content)
     if isinstance(content, Estimate):
         file_format = estimate_format(path, options, recording=recording is not None)
-        _function(file_format.write_estimate)(content, Path(path), recording=recording, **options)
+        file_format.write_estimate(content, Path(path), recording=recording, **options)
     else:
-        _function(_by_ending(path, "write").write)(content, Path(path), **options)
+        _by_ending(path, "write").write(content, Path(path), **options)
 
 
 def estimate_format(
