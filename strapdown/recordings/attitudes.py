@@ -26,9 +26,9 @@ from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, array
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
-from strapdown.records import Innovations, Recording, outputs
+from strapdown.records import Innovations, outputs
 from strapdown.records.estimate import STATES
-from strapdown.records.recording import TIME_UNITS
+from strapdown.records.recording import TIME_UNITS, whole_ns
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
@@ -88,7 +88,7 @@ class Attitudes:
         Attitudes
             Their stamps are rounded to nanoseconds.
         """
-        stamps = _whole_ns(array("time", time, ("m",)))
+        stamps = whole_ns(array("time", time, ("m",)))
         return cls(source=source, stamps_ns=stamps, attitude=attitude, **fields)  # type: ignore[arg-type]
 
     @property
@@ -121,28 +121,22 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
     >>> reference = sd.read_attitudes("flight.bag", topic="/mocap/pose")  # doctest: +SKIP
     >>> reference.attitude.shape  # doctest: +SKIP
     """
+    file = Path(path)
     with reading.from_file(path):
-        return _read(Path(path), topic)
+        format_name = formats.format_of(file).name
+        if format_name == "ROS bag":
+            return _bag(file, topic)
+        if topic:
+            raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
+        if format_name == "BROAD" and (kind := reading.kind(file)):
+            return _own(file, kind)
+        readers = {"ULog": _ulog, "TUM trajectory": _trajectory, "CSV": _table}
+        return readers.get(format_name, _of_recording)(file)
 
 
-def _read(file: Path, topic: str) -> Attitudes:
-    format_name = formats.format_of(file).name
-    if format_name == "ROS bag":
-        return _bag(file, topic)
-    if topic:
-        raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
-    if format_name == "BROAD" and (kind := reading.kind(file)):
-        return _own(file, kind)
-    if format_name == "ULog":
-        return _ulog(file)
-    if format_name == "TUM trajectory":
-        stamps, q = trajectories.read_tum(file)
-        return Attitudes(source=file.name, stamps_ns=stamps, attitude=q, remarks=("TUM trajectory: no covariance.",))
-    return _table(file) if format_name == "CSV" else _of_recording(formats.read(file, gyro_alone=True))
-
-
-def _whole_ns(time: Array) -> NDArray[np.int64]:
-    return np.asarray(np.rint(time * 1e9)).astype(np.int64)
+def _trajectory(path: Path) -> Attitudes:
+    stamps, q = trajectories.read_tum(path)
+    return Attitudes(source=path.name, stamps_ns=stamps, attitude=q, remarks=("TUM trajectory: no covariance.",))
 
 
 def _own(path: Path, kind: str) -> Attitudes:
@@ -157,7 +151,7 @@ def _own(path: Path, kind: str) -> Attitudes:
             bias = reading.numbers(file, "bias") if "bias" in file else None
         return Attitudes(
             source=path.name,
-            stamps_ns=_whole_ns(arrays["time"]),
+            stamps_ns=whole_ns(arrays["time"]),
             attitude=quaternion.normalize(arrays["attitude"]),
             covariance=P,
             error_frame="" if P is None else "body",
@@ -168,15 +162,16 @@ def _own(path: Path, kind: str) -> Attitudes:
         if record.truth is None:
             raise InputError(f"{path} is a record without a truth; simulate one, or give another reference")
         return Attitudes(
-            source=path.name, stamps_ns=_whole_ns(record.time), attitude=record.truth.attitude, bias=record.truth.bias
+            source=path.name, stamps_ns=whole_ns(record.time), attitude=record.truth.attitude, bias=record.truth.bias
         )
     raise InputError(
         f"{path} is a {kind}, which has no attitudes over time; give an estimate, a record or a trajectory"
     )
 
 
-def _of_recording(recording: Recording) -> Attitudes:
-    """Return the reference of a recording."""
+def _of_recording(path: Path) -> Attitudes:
+    """Read the reference of a recording."""
+    recording = formats.read(path, gyro_alone=True)
     if recording.true_attitude is None:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
     known = np.isfinite(recording.true_attitude).all(axis=1)

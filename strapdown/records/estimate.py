@@ -25,7 +25,7 @@ from strapdown.checks import (
 from strapdown.files.extras import library
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
-from strapdown.records.recording import Recording
+from strapdown.records.recording import Recording, whole_ns
 from strapdown.results import ByValue, Column, Listed, Table, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_unit
 
@@ -482,7 +482,7 @@ class Estimate(ByValue, Listed):
         q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
         columns: dict[str, NDArray[np.generic]] = {"time_s": self.time}
         if recording is not None and recording.epoch_ns:
-            columns = {"time_ns": np.rint(self.time * 1e9).astype(np.int64) + recording.epoch_ns}
+            columns = {"time_ns": whole_ns(self.time) + recording.epoch_ns}
         columns |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         axes = sequence.upper()

@@ -200,7 +200,7 @@ class Recording(Listed):
     @property
     def clock_ns(self) -> NDArray[np.int64]:
         """Time stamps (n,) of the source's clock, ns."""
-        return np.rint(self.time * 1e9).astype(np.int64) + self.epoch_ns
+        return whole_ns(self.time) + self.epoch_ns
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -232,26 +232,28 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                 continue  # absent, or of another length, which is rejected below
             rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
             same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
+    columns |= {"time": time, "rate": rate}
     if same.any():
-        columns = _rows(columns, np.concatenate([[True], ~same]))
-        columns["repeated"] = time[1:][same]
-        time, rate = time[np.concatenate([[True], ~same])], rate[np.concatenate([[True], ~same])]
-    known = np.asarray(~np.isnan(rate).any(axis=1))
-    if known.all():
-        return Recording(source=source, time=time, rate=rate, **columns)
-    if np.sum(known) < 2:
-        raise InputError(
-            f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
-        )
-    stamps = increasing(f"{source}: time", time)
-    return Recording(
-        source=source, time=stamps[known], rate=rate[known], missing_gyro=stamps[~known], **_rows(columns, known)
-    )
+        columns = _rows(columns, np.concatenate([[True], ~same])) | {"repeated": time[1:][same]}
+    known = np.asarray(~np.isnan(columns["rate"]).any(axis=1))
+    if not known.all():
+        if np.sum(known) < 2:
+            raise InputError(
+                f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
+            )
+        stamps = increasing(f"{source}: time", columns["time"])
+        columns = _rows(columns, known) | {"missing_gyro": stamps[~known]}
+    return Recording(source=source, **columns)
 
 
 def _rows(columns: dict[str, Any], kept: NDArray[np.bool_]) -> dict[str, Any]:
     """Return the columns with those rows; entries without rows (units, remarks, stamps of repeated rows) are unchanged."""
     return {n: c[kept] if n in _ROWS and np.shape(c)[:1] == kept.shape else c for n, c in columns.items()}
+
+
+def whole_ns(time: Array) -> NDArray[np.int64]:
+    """Return times, s, in ns."""
+    return np.asarray(np.rint(time * 1e9)).astype(np.int64)
 
 
 def relative_time(clock_ns: NDArray[np.int64]) -> tuple[Array, int]:
