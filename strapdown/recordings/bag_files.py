@@ -92,10 +92,6 @@ class Bag:
                 _Scan(self, file, reading.Unpacked(file, len(data)), receiver).file(data)
 
 
-def _unwanted(logged: int, data: Data) -> None:
-    pass
-
-
 @dataclass
 class _Scan:
     """The scan of one file."""
@@ -130,7 +126,7 @@ class _Scan:
             self.bag.faults.append(f"{where}byte {place}: {words}")
 
     def topic(self, number: Any, name: str, kind: str) -> None:
-        self.topics[number] = self.receiver(name, kind) or _unwanted
+        self.topics[number] = self.receiver(name, kind) or (lambda logged, data: None)
 
     def lose(self, logged: int, data: Data) -> None:
         self.lost += 1

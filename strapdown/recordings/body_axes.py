@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -47,34 +48,26 @@ def with_axes(
     for sensor in [invert] if isinstance(invert, str) and invert else invert:
         matrices[sensor] = -matrices.get(sensor, np.eye(3))
         words.append(f"Sign of the {sensor} inverted.")
-    changed: dict[str, Array] = {}
-    for sensor, matrix in matrices.items():
-        column = SENSORS[one_of("axes and invert: sensor", sensor, SENSORS)]
-        samples = getattr(recording, column)
-        if samples is None:
+    for sensor in matrices:
+        if one_of("axes and invert: sensor", sensor, SENSORS) not in recording.parts:
             raise InputError(f"{recording.source} has no {sensor}; leave its axes and its inversion out")
-        changed[column] = samples @ matrix.T
-    result = replace(recording, **changed)  # type: ignore[arg-type]
+    changed: dict[str, Any] = {}
     if whole:
-        result = _turned(result, axes_matrix(whole))
+        turn = axes_matrix(whole)
         words.append(f"Body axes read as ({whole}).")
-    return replace(result, remarks=(*recording.remarks, *words))
+        matrices = {s: turn @ matrices.get(s, np.eye(3)) for s in SENSORS if s in recording.parts}
+        if recording.true_attitude is not None:  # of v' = C v it is R' = R Cᵀ
+            changed["true_attitude"] = _turned(recording.source, recording.true_attitude, turn.T)
+    changed |= {SENSORS[sensor]: getattr(recording, SENSORS[sensor]) @ C.T for sensor, C in matrices.items()}
+    return replace(recording, remarks=(*recording.remarks, *words), **changed)
 
 
-def _turned(recording: Recording, matrix: Array) -> Recording:
-    """Return the recording in the axes v' = C v, for which R' = R Cᵀ."""
-    changed = {
-        column: getattr(recording, column) @ matrix.T
-        for column in SENSORS.values()
-        if getattr(recording, column) is not None
-    }
-    if recording.true_attitude is not None:
-        if np.linalg.det(matrix) < 0.0:
-            raise InputError(
-                f"{recording.source}: axes mirror the unit, but its reference attitude can only be rotated; give the axes of single sensors"
-            )
-        known = np.isfinite(recording.true_attitude).all(axis=1)
-        changed["true_attitude"] = recording.true_attitude.copy()
-        turn = quaternion.from_matrix(matrix.T)
-        changed["true_attitude"][known] = quaternion.multiply(recording.true_attitude[known], turn)
-    return replace(recording, **changed)
+def _turned(source: str, attitude: Array, turn: Array) -> Array:
+    if np.linalg.det(turn) < 0.0:
+        raise InputError(
+            f"{source}: axes mirror the unit, but its reference attitude can only be rotated; give the axes of single sensors"
+        )
+    known = np.isfinite(attitude).all(axis=1)
+    result = attitude.copy()
+    result[known] = quaternion.multiply(attitude[known], quaternion.from_matrix(turn))
+    return result

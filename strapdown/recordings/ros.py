@@ -88,7 +88,7 @@ class Topic:
             try:
                 before = len(self.logged) - len(self.raw)
                 self.parts.append(_decoded(self.raw, self.kind, self.span, self.ros2, before))
-            except _UnreadableError as error:
+            except InputError as error:
                 self.fault = str(error)
         self.raw = []
 
@@ -183,10 +183,6 @@ def _beside(unit: str, candidates: list[Topic]) -> Topic | str | None:
     return f"None of {names} was read, because it is ambiguous which of them belongs to {unit}."
 
 
-class _UnreadableError(ValueError):
-    """A message is not of the type of its topic."""
-
-
 def _decoded(
     raws: Sequence[Data], kind: str, span: tuple[int, int], ros2: bool, before: int
 ) -> tuple[NDArray[np.int64], Array]:
@@ -197,7 +193,7 @@ def _decoded(
 
     def refuse(wrong: NDArray[np.bool_], rows: NDArray[np.int64], what: str) -> None:
         if wrong.any():
-            raise _UnreadableError(f"message {before + int(rows[np.argmax(wrong)]) + 1} is {what}")
+            raise InputError(f"message {before + int(rows[np.argmax(wrong)]) + 1} is {what}")
 
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
