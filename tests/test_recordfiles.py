@@ -93,9 +93,7 @@ def cut(share):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.unlink(), "does not exist"),
         *((cut(share), "cannot be read") for share in (0.0, 0.01, 0.3, 0.6, 0.9, 0.999)),
-        (lambda path: path.write_text("time,x\n1,2\n"), "cannot be read"),
         (foreign, "HDF5 of another program"),
         (
             edited(lambda file: file.attrs.update(kind="strapdown estimate")),

@@ -339,14 +339,12 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
     [
         ("empty.csv", b"", ("is empty", "time,gx")),
         ("binary.csv", bytes(range(256)) * 8, ()),
-        ("none.csv", None, ("does not exist",)),
         ("walk.mat", b"\0" * 100, ("extension '.mat'", ".csv")),
         ("walk.h5", b"time,gx", ("cannot be read as HDF5", "of another kind")),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, name, content, words):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
+    (tmp_path / name).write_bytes(content)
     refused(tmp_path / name, *words)
 
 

@@ -155,3 +155,12 @@ def test_the_keys_are_printed_by_section():
     assert all(section.header in every for section in SECTIONS)
     with pytest.raises(InputError, match=r"no section 'gyros' .* name one of top, motion, gyro, sensors"):
         keys.named("gyros")
+
+
+SYMBOLS = {"": "", "degc": "°C", "kg_m2": "kg m²", "rad_s_per_m": "rad s/m", "deg_per_hour_per_hour": "°/h²"}
+SYMBOLS |= {"deg_per_hour_per_sqrt_hour": "°/h/√h", "nt": "nT", "ratio": "1", "m_per_s2": "m/s²"}
+
+
+@pytest.mark.parametrize("ending", SYMBOLS)
+def test_the_ending_of_a_key_stands_for_a_unit(ending):
+    assert keys.symbol(ending) == SYMBOLS[ending]

@@ -66,6 +66,7 @@ _SPELLINGS = {
     "temperature": {"c": "degC", "celsius": "degC", "degc": "degC"},
 }
 """Other spellings of units, without spaces and in lower case."""
+_PLAIN = str.maketrans({"²": "2", "¹": "1", "⁻": "-", "^": "", "°": "deg", "µ": "u", "μ": "u"})
 _WORDS = {
     "gyro": {"gyro", "gyr", "gyros", "gyroscope", "gyrometer", "g", "w", "omega", "angular", "angularvelocity"},
     "accelerometer": {"acc", "accel", "accl", "accelerometer", "acceleration", "a", "specific"},
@@ -108,8 +109,7 @@ def column(cell: str) -> Column:
 
 def unit_of(group: str, text: str) -> str:
     """Return the package's name of a unit of that group, in any spelling; empty if the text is not a unit."""
-    plain = (text.strip().replace("²", "2").replace("^", "").replace("°", "deg").replace("⁻¹", "-1").replace("⁻2", "-2")
-             .replace("µ", "u").replace("μ", "u"))  # fmt: skip
+    plain = text.strip().translate(_PLAIN)
     if plain in UNITS[group]:
         return plain
     squeezed = re.sub(r"[\s_·*.]", "", plain).lower()
