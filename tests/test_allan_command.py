@@ -101,6 +101,8 @@ def test_terms_not_seen_are_left_out_and_bounded_in_comments(succeeds, tmp_path)
     assert sorted(bounds) == ["bias_instability_deg_per_hour", "quantization_arcsec", "rate_ramp_deg_per_hour_per_hour"]
     assert np.all(np.array(list(bounds.values())) > 0.0)
     fit = allan.fit_noise(walking, 0.01)
+    for row, supported in zip(fit.listing().records, fit.supported.ravel(), strict=True):
+        assert [row[key] is not None for key in ("estimate", "lower", "upper")] == [supported, supported, True]
     assert bounds["quantization_arcsec"] == pytest.approx(fit.upper[:, 0] / units.ARCSECOND, rel=1e-3)
     partly = next(line for line in text.splitlines() if "0 where not detected" in line)
     bound = fit.upper[:2, 3] / units.DEGREE_PER_HOUR_PER_ROOT_HOUR

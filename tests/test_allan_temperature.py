@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from strapdown.allan import temperature as allan_temperature
 from strapdown.checks import InputError
@@ -95,6 +96,16 @@ def test_intervals_of_the_slope_hold_with_a_weak_walk(shape, K):
     assert 0.93 - 0.018 < np.mean(np.abs(error) <= reach[1]) < 0.97 + 0.018
     assert 0.9 < np.sqrt(np.mean((error / polynomial.sigma[1]) ** 2)) < 1.15
     assert np.abs(error / polynomial.sigma[1]).max() < 6.0
+
+
+def test_the_noise_is_that_of_the_greatest_restricted_likelihood():
+    """By a search that uses the likelihood alone, no derivative of it and no expected power."""
+    T = warm_up(3000)
+    bins, _, _ = allan_temperature._binned(records(3000, 1, 2)[:, 0], (T - T.mean())[:, None], DT)
+    start = np.full(len(bins.basis), bins.square.sum() / (bins.basis @ bins.number).sum())
+    fit = allan_temperature._maximised(bins, start, np.ones(len(start), bool))
+    loss = lambda logs: allan_temperature._fitted(bins, np.exp(logs)).loss  # noqa: E731
+    assert fit.loss - minimize(loss, np.log(fit.theta), method="Nelder-Mead", options={"maxiter": 4000}).fun < 1e-6
 
 
 def test_an_interval_of_a_mixture_holds_its_draws():

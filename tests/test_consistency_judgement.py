@@ -181,8 +181,10 @@ def test_refused_measurements_are_left_out():
     assert any("20 measurements of star 1" in limit for limit in judgement.limits)
 
 
-def test_a_truth_at_other_times_is_refused():
+def test_a_truth_at_other_times_and_a_level_of_zero_are_refused():
     result, truth = estimate()
+    with pytest.raises(InputError, match="confidence_level is 0"):
+        consistency.judge(result, truth, confidence_level=0.0)
     with pytest.raises(InputError, match="own times"):
         consistency.judge(result, Truth(attitude=truth.attitude[:5], bias=truth.bias[:5]))
 

@@ -646,6 +646,7 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         ("time_s,qw,qx,qy,qz,cov_xx_rad2,cov_yy_rad2", "1,1,0,0,0,1,1", "cov_zz is missing|cov_xy is missing"),
         ("time_s,qw,qx,qy,qz,cov_body_xx,cov_fixed_yy", "1,1,0,0,0,1,1", "name all its columns alike"),
         ("time_s,qw,qx,qy,qz,q_w", "1,1,0,0,0,1", "has the same meaning"),
+        ("time_s,qw,qx,qy,qz", "3,,,,\n4,1,0,0,0", "row 4 is not after the one before"),
     ],
 )
 def test_bad_tables_are_refused(tmp_path, header, row, message):
@@ -712,11 +713,15 @@ def test_a_definition_of_the_covariance_that_thousands_of_errors_show_is_certain
 def test_an_alignment_is_described_with_its_sigma():
     sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
     fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE
-    known = {"covariance": np.diag(sigma**2), "estimated": ("time", "fixed", "body"), "residual": 0.0}
-    clock, *frames = alignment.Alignment(offset=1.5, fixed=fixed, body=body, sigma=sigma, **known).words
+    known = {"covariance": np.diag(sigma**2), "estimated": ("time", "fixed", "body"), "residual": 7.0 * DEGREE}
+    described = alignment.Alignment(offset=1.5, fixed=fixed, body=body, sigma=sigma, **known)
+    clock, *frames = described.words
     assert clock.startswith("clocks differ by 1.5 s ± 0.25 s")
     assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° an axis")
     assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° an axis")
+    *numbers, residual = [value for key, value in described.summary().items() if key != "removed"]
+    np.testing.assert_allclose(np.hstack(numbers), [1.5, 0, 3, 4, 6, 0, 0, 2, 2, 2, 5, 5, 5, 0.25], rtol=1e-12)
+    assert residual == pytest.approx(7.0)
 
 
 def test_times_without_anything_in_common_are_refused(run):

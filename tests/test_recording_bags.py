@@ -13,6 +13,7 @@ from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, bag_files, read
+from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Estimate
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
@@ -323,6 +324,11 @@ def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(
     np.testing.assert_allclose(units[10].orientation_covariance.reshape(3, 3), np.diag([9.0, 1.0, 4.0]), atol=1e-12)
     assert (units[10].orientation.w, units[10].orientation.z) == (0.5, 0.5)
     assert units[10].angular_velocity.x == recording.rate[10, 0]
+    certain = replace(estimate, variance=np.zeros((30, 6)))
+    recordings.write(certain, tmp_path / f"certain.{suffix}", recording=recording)
+    back = read_attitudes(tmp_path / f"certain.{suffix}")
+    assert back.covariance is None
+    assert back.remarks[-1] == "Its covariances are zero: unknown."
     other = tmp_path / f"other.{'mcap' if suffix == 'bag' else 'bag'}"  # messages of the other ROS cannot be copied
     recordings.write(estimate, other, recording=recording, source=source)
     with AnyReader([other]) as reader:

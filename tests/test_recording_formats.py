@@ -152,6 +152,12 @@ def test_a_flight_log_uses_the_time_of_the_samples(ulog, monkeypatch):
     recording = read(path)
     same(recording, whole, "magnetic_field")
     assert "offset by -30 ms from the gyro's stamps" in " ".join(recording.remarks)
+    # Logs of earlier firmware have the field beside the rates, where a stamp of 2³¹ − 1 says that there is no new sample.
+    data["sensor_combined"] |= {f"magnetometer_ga[{k}]": whole.magnetic_field[:, k].copy() for k in range(3)}
+    data["sensor_combined"]["magnetometer_timestamp_relative"] = np.where(np.arange(60) < 30, 2**31 - 1, 0)
+    next(topic for topic in log.data_list if topic.name == "vehicle_magnetometer").name = "vehicle_magnetometer_bias"
+    expected = np.where(np.arange(60)[:, None] < 30, np.nan, whole.magnetic_field)
+    np.testing.assert_array_equal(read(path).magnetic_field, expected)
 
 
 def test_the_library_reads_the_attitude_as_px4_has_it(ulog):

@@ -66,6 +66,12 @@ def test_without_noise_a_sensor_measures_its_reference_in_body_axes(sensor):
 
 
 @pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
+def test_a_sensor_that_never_samples_is_refused(sensor):
+    with pytest.raises(InputError, match=f"{sensor.name}: rate is 0 Hz"):
+        dataclasses.replace(sensor, rate=0.0)
+
+
+@pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
 def test_noise_has_the_sigma_that_the_series_states(sensor):
     """Beside it noise so quick that it is white, of twice the σ, in the same unit."""
     size = 2.0 * getattr(sensor, "sigma", 1e-4)

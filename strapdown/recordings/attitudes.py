@@ -258,7 +258,7 @@ def _table(path: Path) -> Attitudes:
         bias = None  # its covariance is not given
     back = np.diff(stamps[known]) <= 0
     if back.any():
-        row = int(np.argmax(back)) + 2
+        row = int(np.flatnonzero(known)[1:][back][0]) + 1
         raise InputError(
             f"{path.name}: row {row} is not after the one before; sort the rows, or check the unit of time"
         )
