@@ -328,6 +328,7 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
     assert causes[0]["name"] == "wrong convention"
     assert causes[0]["significant"]
+    assert causes[0]["estimate"] == causes[0]["standard_error"] == []  # it has no size
     explanation, reason = sd.diagnose(sd.read("out/estimate.h5"), sd.read("record.h5"))
     assert reason == ""
     saved = json.loads((tmp_path / "check.json").read_text())["diagnosis"]

@@ -733,6 +733,18 @@ def test_times_without_anything_in_common_are_refused(run):
         alignment.at_common_times(own, alignment.Series(own.time + 20.0, own.attitude), 5.0)
 
 
+@pytest.mark.parametrize("offset", [-5.0, 5.0])
+def test_a_sparser_truth_gives_the_times_within_those_of_the_estimate(offset):
+    turned = lambda time: quaternion.exp(np.outer(time, [0.0, 0.0, 0.1]))  # noqa: E731
+    own, theirs = np.arange(101) / 10.0, np.arange(-30.0, 31.0)
+    common, truth = alignment.at_common_times(
+        alignment.Series(own, turned(own)), alignment.Series(theirs, turned(theirs)), offset
+    )
+    np.testing.assert_array_equal(common.time, np.arange(11.0) + offset)
+    np.testing.assert_allclose(common.attitude, turned(common.time - offset), atol=1e-12)
+    np.testing.assert_array_equal(truth.attitude, turned(common.time))
+
+
 @pytest.mark.parametrize("phi", [0.0, 0.8])
 def test_the_p_value_of_a_constant_has_its_size_and_its_power(phi):
     """By 100 series of two autoregressive scores: the mean is zero, or off by five of its σ."""

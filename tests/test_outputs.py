@@ -86,6 +86,8 @@ def test_heading_of_a_tilted_body_has_the_sigma_of_differences():
     np.testing.assert_allclose(heading.sigma, np.sqrt(np.einsum("ni,nij,nj->n", J, P, J)), rtol=1e-5)
     up = quaternion.from_rotation(Rotation.from_euler("y", -90.0, degrees=True))
     assert np.isinf(outputs.heading(up[None], np.eye(3)[None]).sigma[0])
+    with np.errstate(divide="raise", invalid="raise"):  # no warning where it is exactly up
+        assert np.isinf(outputs.heading([[1.0, 0, 0, 0]], np.eye(3)[None], axis="z").sigma[0])
 
 
 def test_north_east_down():

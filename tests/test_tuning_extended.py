@@ -192,12 +192,14 @@ def test_it_is_that_of_ordinary_runs_and_score_and_curvature_are_its_derivatives
 def test_evaluations_are_ordinary_runs_but_prepare_the_gyro_only_once(spacing, monkeypatch):
     """Neither the integration of the gyro nor the angular acceleration at the measurements depends on what is tuned."""
     scenario = swaying(20.0)
+    matched = filter_setup(scenario)
+    states = dataclasses.replace(matched.states, gyro_fast_bias_sigma=1e-4)
     matched = dataclasses.replace(
-        filter_setup(scenario), integration=coning.ALGORITHMS["two-sample"], sigma={"mag": 6e-7}
+        matched, integration=coning.ALGORITHMS["two-sample"], sigma={"mag": 6e-7}, states=states
     )
     case = case_of(scenario, matched, 5)
     objective = tuning.likelihood([case], matched, ["gyro.arw", "acc.sigma", "acc.lever_sigma"], spacing=spacing)
-    point, epochs = objective.start + 0.1, np.arange(10, 200, 10)
+    point, epochs = objective.start + 0.1, np.arange(0, 200, 10)
     used = objective.setup(point)
     record = setup.modelled_record(case.record, used)
     record = dataclasses.replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))

@@ -81,6 +81,15 @@ def test_of_right_filters_hardly_one_is_suspected():
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
 
 
+def test_measurements_with_a_sigma_for_each_axis_are_not_examined():
+    case, result = tuned(10)
+    star, *others = case.record.vectors
+    record = dataclasses.replace(
+        case.record, vectors=(dataclasses.replace(star, sigma=0.0, sigma_axes=[1e-4, 2e-4, 2e-4]), *others)
+    )
+    assert tuning.examined([dataclasses.replace(case, record=record)], result.setup, result) is result
+
+
 def test_the_turns_are_those_of_the_body_without_its_bias():
     case, result = tuned(4)
     initial = setup.initial_state(result.setup, case.initial.attitude, case.initial.bias)
