@@ -93,6 +93,12 @@ def test_a_gap_does_not_spoil_it(turned):
     assert np.abs(normalised(unit, sd.calibrate(recording.taken(kept)))).max() < 4.0
 
 
+def test_no_interval_goes_over_a_gap(turned):
+    _, recording, _ = turned
+    kept = recording.taken((recording.time < 21.0) | (recording.time > 26.0))
+    assert intervals.gathered([kept]).step.max() < 1.01 / study.RATE
+
+
 def test_missing_motion_is_said():
     unit = study.drawn_unit(4)
     recording = study.simulated(unit, 4, 0, 30.0)

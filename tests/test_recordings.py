@@ -390,7 +390,7 @@ def test_samples_go_to_the_nearest_stamp_the_closest_of_several():
     placed, lost = at_nearest(time, other, other[:, None])
     np.testing.assert_array_equal(placed[:, 0], wanted)
     assert lost == 150 - np.isfinite(wanted).sum()
-    first_and_last, _ = at_nearest(np.arange(4.0), np.array([0.1, 2.9]), np.array([[1.0], [2.0]]))
+    first_and_last, _ = at_nearest(np.arange(4.0), np.array([-1.0, 2.9]), np.array([[1.0], [2.0]]))
     np.testing.assert_array_equal(first_and_last[:, 0], [1.0, np.nan, np.nan, 2.0])
 
 

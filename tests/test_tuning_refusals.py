@@ -12,11 +12,13 @@ from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
+from strapdown.recordings import Recording
 
 ONE = case(duration=20.0)
 ATTITUDE_ALONE = replace(ONE, record=replace(ONE.record, truth=None), true_attitude=ONE.record.truth.attitude)
 SILENT = replace(ONE.record.vectors[0], sigma=np.zeros(1))
 SILENT = replace(ONE.record, vectors=(SILENT, *ONE.record.vectors[1:]))
+BARE = Recording(source="bare", time=np.arange(5000) / 100.0, rate=np.zeros((5000, 3)))
 COMPASS = replace(
     scenario(5.0),
     motion=HAND,
@@ -62,6 +64,7 @@ TABLE = [
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
     (tuning.error_objective, ([ONE, ATTITUDE_ALONE], BELIEVED, FREE), {}, "on records of one kind"),
+    (tuning.recording_case, (BARE,), {}, "bare has no accelerometer samples"),
     (tuning.values_of, (BELIEVED, ["star 1.sigma"], [SILENT]), {}, "sigma is 0"),
     (tuning.Prior, (), {"value": 1.0, "factor": 1.0}, "factor of the prior is 1.0; .* greater than 1"),
     (tuning.fit, (free(*FREE),), {"priors": UNSPECIFIED}, "priors"),
