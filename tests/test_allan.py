@@ -720,7 +720,7 @@ RECORD = np.random.default_rng(0).standard_normal(200)
         (lambda: allan.fit_noise(RECORD[:50], 0.1), "50 samples"),
         (lambda: allan.fit_noise(RECORD, 0.1, terms=["angle_walk"]), "did you mean 'angle_random_walk'"),
         (lambda: allan.fit_noise(RECORD, 0.1, terms=["rate_ramp"]), "no random noise"),
-        (lambda: allan.fit_noise(RECORD, 0.1, highest_frequency=0.01), "raise it"),
+        (lambda: allan.fit_noise(RECORD, 0.1, highest_frequency=0.5), "only 20 coefficients are below it; raise it"),
         (lambda: allan.fit_noise(RECORD, 0.1, sensor="giro"), "did you mean 'gyro'"),
         (lambda: allan.fit_noise(np.full(100, 0.1), 0.1), "no noise"),
         (lambda: allan.fit_noise(0.1 * np.arange(100), 0.1), "no noise"),

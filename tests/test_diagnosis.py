@@ -272,6 +272,8 @@ def test_commutation_drift_has_its_formulas_sign_and_size():
         assert drift[2] == pytest.approx(expected, rel=0.06)
         assert abs(drift[0]) < 0.02 * abs(drift[2])
         assert error[2] < 0.1 * abs(drift[2])
+        short, _ = diagnosis.commutation_drift(records.cut(record, 0, 12), coning.ALGORITHMS[name])
+        assert short[2] == pytest.approx(expected, rel=0.06)
 
 
 # ------------------------------------------------------------------------------------------------------------------- the rest

@@ -531,6 +531,12 @@ def test_triads_of_several_vectors_are_those_of_each_whatever_its_length():
     np.testing.assert_allclose(triad(several), np.stack([triad(vector) for vector in several]), atol=1e-14)
 
 
+@pytest.mark.parametrize("shape", [3, (2, 3)])
+def test_the_zero_vector_has_no_triad(shape):
+    with pytest.raises(InputError, match="zero vector, which has no direction"):
+        triad(np.zeros(shape))
+
+
 def test_a_baseline_is_one_vector():
     fields = {"name": "antennas", "sigma": 0.01, "rate": 4.0}
     assert HeadingPair(baseline_b=[2, 0, 0], **fields).baseline_b.dtype == np.float64
