@@ -361,10 +361,7 @@ def test_a_series_may_be_missing_altogether(kind):
 @pytest.mark.parametrize(
     ("make", "field", "value"),
     [
-        *(
-            (VectorSensor, *pair)
-            for pair in (("rate", 0.0), ("sigma", -1.0), ("reference_f", [0.0, 0.0, 0.0]), ("kind", "attitude"))
-        ),
+        *((VectorSensor, *pair) for pair in (("sigma", -1.0), ("reference_f", [0.0, 0.0, 0.0]), ("kind", "attitude"))),
         *(
             (Faults, *pair)
             for pair in (
