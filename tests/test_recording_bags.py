@@ -173,6 +173,8 @@ def test_equal_stamps_are_not_out_of_order(bag):
 def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_path):
     with pytest.raises(InputError, match=r"has no message of sensor_msgs/msg/Imu; give a bag"):
         read(bag("bag", [("/chatter", "String", START, "", "x")]))
+    with pytest.raises(InputError, match=r"topic /imu/data has no orientation in its 40 messages"):
+        read_attitudes(bag("mcap", imu()[1]))
     fake = tmp_path / "fake.bag"
     fake.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     with pytest.raises(InputError, match=r"fake.bag cannot be read as a ROS bag .* has no complete message"):
