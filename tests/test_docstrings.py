@@ -59,7 +59,8 @@ def _callables(module: str) -> Iterator[tuple[str, Any]]:
     for name, value in _public(module).items():
         if not (inspect.isfunction(value) or inspect.isclass(value)):
             continue
-        if module == "strapdown" and value.__module__.split(".")[1] in strapdown.__all__:
+        owner = value.__module__.split(".")[1]
+        if module == "strapdown" and owner in strapdown.__all__ and name in _public(f"strapdown.{owner}"):
             continue  # its own module documents it
         full = f"{module}.{name}"
         yield full, value

@@ -113,7 +113,24 @@ class Attitudes:
 
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
-    """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes.
+    """Read the attitudes of a file with an estimate or a reference of any filter.
+
+    Parameters
+    ----------
+    path : str or path
+        TUM trajectory, table, ULog, bag (for ROS 2 its folder), recording with a reference, or result of this package.
+    topic : str, optional
+        For a bag: its topic, if several have attitudes.
+
+    Returns
+    -------
+    Attitudes
+        Time stamps, q_fb, and covariance, bias and innovations if the file has them.
+
+    Raises
+    ------
+    InputError
+        If the file has no attitudes, cannot be read, or several topics of a bag have attitudes.
 
     Examples
     --------
