@@ -107,9 +107,9 @@ def integrate(
     with ui.progress_bar("reading, integrating, writing"):
         source: Any = sd.read(recording, gyro_alone=True, **layout.options)
         with reading.from_file(recording):
-            history = sd.integrate(source, rule)
-        sd.write(history, out)
-    ui.say(f"{recording.name}: {history.remarks[0]}", *history.remarks[1:])
+            estimate = sd.integrate(source, rule)
+        sd.write(estimate, out)
+    ui.say(f"{recording.name}: {estimate.remarks[0]}", *estimate.remarks[1:])
     ui.written(out)
 
 
@@ -122,6 +122,5 @@ def coning_budget(
 ) -> dict[str, Any]:
     """Predict the drift caused by an angular vibration spectrum, for each algorithm and sample rate."""
     lines = sd.coning.read_vibration(psd)
-    listing = sd.coning.vibration_table(lines, rate, algorithm)
-    ui.show(listing)
+    ui.show(listing := sd.coning.vibration_table(lines, rate, algorithm))
     return {"lines": len(lines), "budget": listing.records}
