@@ -150,7 +150,7 @@ def quick(option, kind):
 )
 def test_both_faces_are_one_filter(option, kind, schedule):
     options, whole = OPTIONS[option]
-    record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=1.2), 5)
+    record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=1.2), 3)
     if whole is not None:
         record = anisotropic(record, whole)
     result = estimation.run(record, NOISE, near(record), full_covariance=True, **options)
