@@ -25,7 +25,7 @@ HEAD = 4096
 """Number of bytes at the start of a file from which its format is recognised."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Format:
     """One format of recordings or estimates."""
 
