@@ -319,9 +319,9 @@ def judge(
     why = NO_TRUTH if estimate.has_covariance else NO_COVARIANCE
     untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], why)
     truth = estimate.truth if truth is None else truth
-    if truth is None:
+    if truth is None and findings:
         limits.append(WITHOUT_TRUTH)
-    elif estimate.has_covariance:
+    elif truth is not None and estimate.has_covariance:
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         names = tuple(estimate.error_states)

@@ -17,7 +17,7 @@ from strapdown.checks import Array
 from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
-from strapdown.records import Estimate, Truth
+from strapdown.records import Estimate, Truth, outputs
 from strapdown.units import DEGREE, angle_unit, error_state_unit, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
@@ -52,6 +52,11 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
     return ax
 
 
+def roll_pitch_yaw(attitude: Array) -> Array:
+    """Return roll, pitch and yaw of the sequence Z-Y-X (n, 3), degrees."""
+    return np.rad2deg(outputs.euler(attitude).angles[:, ::-1])
+
+
 def angle_labels(fixed_frame: str = "") -> tuple[str, str, str]:
     """Return labels of roll, pitch and yaw of the sequence Z-Y-X, with their positive directions.
 
@@ -80,8 +85,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     figure, axes = style.new_figure(
         len(heights), 1, size=(9.0, 10.0 * sum(heights) / 6.0), sharex=True, height_ratios=heights
     )
-    euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
-    for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
+    for ax, angle, name in zip(axes, roll_pitch_yaw(estimate.attitude).T, angle_labels(fixed_frame), strict=False):
         ax.plot(*unbroken(estimate.time, angle), color=style.BLUE, linewidth=0.9)
         ax.set_ylabel(f"{name.split()[0]}, °")
         if np.ptp(angle) > 180.0:

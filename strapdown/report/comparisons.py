@@ -10,7 +10,7 @@ import numpy as np
 from strapdown import quaternion
 from strapdown.checks import Array, InputError
 from strapdown.estimation import setup
-from strapdown.plots.estimates import angle_labels
+from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate
 from strapdown.records.recording import interpolated
@@ -73,7 +73,7 @@ def _at(estimate: Estimate, time: Array) -> tuple[Array, Array, Array]:
 
 
 def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str], fixed_frame: str) -> list[str]:
-    euler = [quaternion.to_rotation(q).as_euler("ZYX", degrees=True)[:, ::-1] for q in attitudes]
+    euler = [roll_pitch_yaw(q) for q in attitudes]
     return [
         page.chart(
             label,

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from strapdown import consistency, plots, quaternion, records, workflows
 from strapdown.checks import Array
 from strapdown.estimation import setup
-from strapdown.plots.estimates import angle_labels
+from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import page
@@ -83,7 +83,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
     else:
-        euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
+        euler = roll_pitch_yaw(estimate.attitude)
         series = [
             page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
             for k, name in enumerate(angle_labels(estimate.fixed_frame))
