@@ -329,7 +329,7 @@ def _unit(name: str, q: Array) -> Array:
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
     topics, _, words = ros.topics_of(path, ros.ORIENTED)
-    oriented = ros.chosen(path.name, topics, topic, "topics with orientations", list(ros.ORIENTED))
+    oriented = ros.topic_of(path.name, topics, topic, "topics with orientations", list(ros.ORIENTED))
     stamps, values, order_words = oriented.decoded(path.name)
     q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
     known = q.any(axis=1) & (P[:, 0] != -1.0 if P.size else True)

@@ -23,7 +23,14 @@ from strapdown.records import Estimate
 from strapdown.records.recording import CLOCK_OFFSET, FIELDS, Recording
 
 
-def from_table(table: Any, *, source: str = "table", **options: Any) -> Recording:
+def from_table(
+    table: Any,
+    *,
+    source: str = "table",
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
     """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
     ``source`` is its name in messages; options as for :func:`strapdown.read`.
@@ -52,7 +59,7 @@ def from_table(table: Any, *, source: str = "table", **options: Any) -> Recordin
         return x.astype(np.int64) if large else None
 
     load = lambda places, time: {k: values(k, time) for k in places}  # noqa: E731
-    return naming.recording(source, names, load, clock_ns, **options)
+    return naming.recording(source, names, load, clock_ns, units=units, columns=columns, gyro_alone=gyro_alone)
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
@@ -124,7 +131,13 @@ def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
     return {name: values for name, values in columns.items() if len(values) == length}
 
 
-def read_parquet(file: Path, **options: Any) -> Recording:
+def read_parquet(
+    file: Path,
+    *,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     types = library("pyarrow.types", "Parquet")
@@ -134,7 +147,7 @@ def read_parquet(file: Path, **options: Any) -> Recording:
         flat = [k for k, column in enumerate(schema) if types.is_primitive(column.type) or types.is_null(column.type)]
         reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
-    return from_table(_of_arrow(table), source=file.name, **options)
+    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
 
 
 def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:

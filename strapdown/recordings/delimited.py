@@ -21,7 +21,6 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,13 @@ _LARGE = 10**15
 """Integers above this may lose digits as float64."""
 
 
-def read_csv(file: Path, **options: Any) -> Recording:
+def read_csv(
+    file: Path,
+    *,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
@@ -44,7 +49,8 @@ def read_csv(file: Path, **options: Any) -> Recording:
     :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     table = Table(file)
-    return naming.recording(file.name, table.header, table.load, table.clock_ns, **options)
+    header, load, clock_ns = table.header, table.load, table.clock_ns
+    return naming.recording(file.name, header, load, clock_ns, units=units, columns=columns, gyro_alone=gyro_alone)
 
 
 class Table:

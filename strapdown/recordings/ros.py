@@ -127,7 +127,7 @@ class Topic:
 def read_bag(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     topics, _, remarks = topics_of(file, READ)
-    topic_name = chosen(file.name, topics, topic, "inertial units", [IMU]).name
+    topic_name = topic_of(file.name, topics, topic, "inertial units", [IMU]).name
     stamps, values, order_words = topics[topic_name].decoded(file.name)
     said = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks, *order_words]
     if values[0, 3] == -1.0:
@@ -155,7 +155,7 @@ def read_bag(file: Path, *, topic: str) -> Recording:
     )
 
 
-def chosen(name: str, topics: Mapping[str, Topic], topic: str, what: str, kinds: Collection[str]) -> Topic:
+def topic_of(name: str, topics: Mapping[str, Topic], topic: str, what: str, kinds: Collection[str]) -> Topic:
     """Return the topic of one of these kinds that is named, or the only one; ``what`` they are, for messages."""
     filled = {t.name: t for t in topics.values() if t.kind in kinds and len(t)}
     if not filled:
