@@ -157,6 +157,11 @@ ENDLESS = (
 )
 MESSAGE = "INSERT INTO messages VALUES (1, 1, 1, x'00')"
 GENERATED = MESSAGES.replace("data)", "data AS (zeroblob(900000000)))")
+SHORT = GENERATED.replace("900000000", "4000")
+ROWS = (
+    "INSERT INTO messages (id, topic_id, timestamp) "
+    "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 3000) SELECT i, 9, i FROM n"
+)
 UNIT = "INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu')"
 
 
@@ -166,6 +171,7 @@ UNIT = "INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu')"
         ([TOPICS, UNIT, f"CREATE VIEW messages AS {ENDLESS}"], "it has no table messages"),
         ([MESSAGES, f"CREATE VIEW topics AS {ENDLESS}"], "it has no table topics"),
         ([TOPICS, UNIT, GENERATED, "INSERT INTO messages VALUES (1, 1, 1)"], "too big|not authorized"),
+        ([TOPICS, UNIT, SHORT, ROWS], "its rows are longer than the file, so a column is generated|not authorized"),
         ([TOPICS, UNIT, MESSAGES, "INSERT INTO messages VALUES (1, 1, NULL, 'text')"], "1 messages are of no topic"),
         ([TOPICS, UNIT.replace("'/imu'", "NULL"), MESSAGES, MESSAGE], "1 messages are of no topic"),
         ([TOPICS, UNIT.replace("'/imu'", "CAST(x'ff' AS TEXT)"), MESSAGES, MESSAGE], "topic �: message 1 is 1 bytes"),

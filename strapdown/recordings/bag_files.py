@@ -13,7 +13,7 @@ import re
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -286,19 +286,20 @@ class _Scan:
         database.text_factory = lambda text: text.decode(errors="replace")
         database.set_authorizer(_only_reads)
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, size)  # of a value, which a generated column may make up
-        kinds = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+        select = lambda what: _stored(database.execute(f"SELECT {what}"), size)  # noqa: E731
+        kinds = dict(select("name, sql FROM sqlite_master WHERE type = 'table'"))
         for name in ("topics", "messages"):
             if not str(kinds.get(name, "")).upper().startswith("CREATE TABLE"):
                 raise ValueError(f"it has no table {name}, so it is no bag")
         if "message_definitions" in kinds:
             columns = "topic_type, encoding, encoded_message_definition"
-            for name, encoding, text in database.execute(f"SELECT {columns} FROM message_definitions"):
+            for name, encoding, text in select(f"{columns} FROM message_definitions"):
                 if encoding == "ros2msg":
                     self.bag.definitions[str(name)] = str(text)
-        for number, name, kind in database.execute("SELECT id, name, type FROM topics"):
+        for number, name, kind in select("id, name, type FROM topics"):
             if isinstance(name, str) and isinstance(kind, str):
                 self.topic(number, name, kind)
-        for number, logged, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+        for number, logged, raw in select("topic_id, timestamp, data FROM messages ORDER BY id"):
             self.number += 1
             if type(logged) is int and type(raw) is bytes:
                 self.topics.get(number, self.lose)(logged, self.whole(raw))
@@ -312,6 +313,15 @@ class _Scan:
         content = self.unpack("zstd", data)
         self.unpacked.take(len(content))
         return content
+
+
+def _stored(rows: Iterable[tuple[Any, ...]], size: int) -> Iterator[tuple[Any, ...]]:
+    """Yield rows of a database of this size, bytes; more than that is not stored, but made up by a generated column."""
+    for row in rows:
+        size -= sum(len(value) for value in row if isinstance(value, str | bytes))
+        if size < 0:
+            raise ValueError("its rows are longer than the file, so a column is generated")
+        yield row
 
 
 def _only_reads(action: int, *_: Any) -> int:
