@@ -7,6 +7,7 @@ shows it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -173,7 +174,7 @@ class FilterOutcome:
     epochs: Array = field(repr=False)
     """Indices of the epochs judged."""
 
-    @property
+    @functools.cached_property
     def judgement(self) -> Judgement:
         """Verdict on the filter, that of any Monte Carlo, at the judged epochs."""
         return self.statistics.judge(epochs=self.epochs)
