@@ -294,6 +294,18 @@ def test_what_one_estimate_shows_serves_the_next():
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_a_state_of_two_equal_entries_corrects_both():
+    block = ErrorStateEstimate(
+        components=("x", "xy=yx"),
+        units=("1", "rad"),
+        values=np.array([[1e-3, 2e-3]]),
+        variance=np.array([[1e-8, 4e-8]]),
+    )
+    shown = with_gyro_states(None, block, 0.0, "")
+    np.testing.assert_allclose(shown.gyro_matrix, [[1e-3, 2e-3, 0.0], [2e-3, 0.0, 0.0], [0.0, 0.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(shown.sigma.gyro_matrix[:2, :2], [[1e-4, 2e-4], [2e-4, 0.0]])
+
+
 def test_corrections_of_the_gyro_follow_one_another(turned):
     known = UnitCalibration(gyro_matrix=MATRIX, accelerometer_bias=[0.1, 0.2, 0.3])
     values = np.array([[0.0] * 9, [1e-3, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1e-3]])

@@ -74,6 +74,7 @@ class ReferenceError(error_states.ErrorStates):
 OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
     "none": (),
     "gyro scale": (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
+    "symmetric gyro scale": (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01, symmetric=True),),
     "gyro drift": (error_states.GyroGaussMarkov(bias_sigma=np.array([3e-3, 4e-3, 5e-3]), correlation_time=1.5),),
     "hard iron": (error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),),
     "hard iron that walks": (error_states.VectorBias(sensor="mag", bias_sigma=5e-6, rate_random_walk=1e-7, unit="T"),),
@@ -157,6 +158,7 @@ def face_at(blocks: tuple[error_states.ErrorStates, ...], values=None, body_moti
 
 GYRO_OPTIONS = {
     "gyro scale": (*OPTIONS["gyro scale"], *OPTIONS["hard iron that walks"]),
+    "symmetric gyro scale": OPTIONS["symmetric gyro scale"],
     "gyro drift": OPTIONS["gyro drift"],
     "all": OPTIONS["all"],
 }
@@ -173,7 +175,10 @@ def test_the_turn_is_what_the_gyro_model_says(option):
         values = face.values[first : first + block.size]
         first += block.size
         if isinstance(block, error_states.GyroScale):
-            M = values.reshape(3, 3)
+            if block.symmetric:
+                M[np.triu_indices(3)] = M.T[np.triu_indices(3)] = values
+            else:
+                M = values.reshape(3, 3)
         if isinstance(block, error_states.GyroGaussMarkov):
             tau = block.correlation_time
             drift = values * tau * (1.0 - math.exp(-dt / tau))

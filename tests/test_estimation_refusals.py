@@ -165,6 +165,11 @@ TABLE = [
     (Robust, {"iterations": 0}, "iterations"),
     # Error states.
     (GyroScale, {"scale_sigma": np.zeros(3), "misalignment_sigma": np.zeros((3, 3))}, "misalignment_sigma are both 0"),
+    (
+        GyroScale,
+        {"scale_sigma": 0.01, "misalignment_sigma": np.triu(np.ones((3, 3)), 1), "symmetric": True},
+        "misalignment_sigma of xy and yx differ",
+    ),
     (GyroForce, {"along_sigma": 0.0}, "along_sigma and across_sigma are both 0"),
     (LeverArm, {"sensor": "acc", "arm_sigma": 0.0}, "arm_sigma is 0"),
     (LeverArm, {"sensor": "acc", "arm_sigma": [0.1, -1.0, 0.0]}, "arm_sigma[1] is -1 m"),

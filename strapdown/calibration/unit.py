@@ -217,12 +217,14 @@ def with_gyro_states(
 ) -> UnitCalibration:
     """Return a calibration with the last values of the states of gyro scale and misalignment that a filter estimated with it.
 
-    The states are named x, xy, … by row and column of M; ``magnetometer_delay`` and ``source`` are those of the recording.
+    The states are named x, xy, … by row and column of M, two equal entries xy=yx; ``magnetometer_delay`` and ``source`` are those of the
+    recording.
     """
     further, sigma = np.zeros((2, 3, 3))
     for name, value, variance in zip(block.components, block.values[-1], block.variance[-1], strict=True):
-        entry = AXES.index(name[0]), AXES.index(name[-1])
-        further[entry], sigma[entry] = value, np.sqrt(variance)
+        for entry in name.split("="):
+            place = AXES.index(entry[0]), AXES.index(entry[-1])
+            further[place], sigma[place] = value, np.sqrt(variance)
     own = calibration or UnitCalibration()
     return replace(
         own,

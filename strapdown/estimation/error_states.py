@@ -183,7 +183,20 @@ def _matrix(
     return tuple(ENTRIES[k] for k in nonzero), whole[nonzero]
 
 
-def _units_of_entries(names: tuple[str, ...]) -> Array:
+def _pairs(name: str, sigma: dict[str, float]) -> tuple[tuple[str, ...], Array]:
+    """Return names and σ of the states of a symmetric matrix: its diagonal, and each pair of equal entries, such as xy=yx."""
+    pairs = {}
+    for entry, value in sigma.items():
+        opposite = entry[::-1]
+        if sigma.get(opposite) != value:
+            raise InputError(
+                f"{name}: misalignment_sigma of {entry} and {opposite} differ; they are one state of a symmetric matrix"
+            )
+        pairs[entry if entry == opposite else "=".join(sorted((entry, opposite)))] = value
+    return tuple(pairs), np.array(list(pairs.values()))
+
+
+def _units_of_entries(names: Sequence[str]) -> Array:
     """Return for each named entry the matrix (3, 3) that is 1 there and 0 elsewhere."""
     return np.asarray(np.eye(9)[[ENTRIES.index(name) for name in names]].reshape(-1, 3, 3))
 
@@ -200,18 +213,24 @@ class GyroScale(ErrorStates):
         Standard deviation of each scale factor, dimensionless.
     misalignment_sigma : float or ndarray (3, 3)
         Standard deviation of each misalignment, rad, by entry of M; zeros on the diagonal.
+    symmetric : bool, default False
+        Whether M is symmetric: a pair of equal misalignments is one state. The other part of M is a rotation of the gyro relative to
+        the body axes, which is zero if these are defined by the gyro.
     name : str, default "gyro scale"
         Name of these error states.
     """
 
     scale_sigma: float | Array
     misalignment_sigma: float | Array
+    symmetric: bool = False
     name: str = "gyro scale"
 
     def __post_init__(self) -> None:
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
         fields = ("scale_sigma", "misalignment_sigma")
         components, sigma = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, fields)
+        if self.symmetric:
+            components, sigma = _pairs(self.name, dict(zip(components, sigma, strict=True)))
         self._set(
             components=components,
             units=tuple("1" if component in AXES else "rad" for component in components),
@@ -220,8 +239,8 @@ class GyroScale(ErrorStates):
 
     @property
     def gyro_scale(self) -> Array:
-        """One entry of M per state."""
-        return _units_of_entries(self.components)
+        """One entry of M per state, or two that are equal."""
+        return np.array([_units_of_entries(component.split("=")).sum(axis=0) for component in self.components])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -164,6 +164,8 @@ class States(ByValue):
         σ of the gyro's scale factors, dimensionless, by axis.
     gyro_misalignment_sigma : float or tuple (3, 3), default 0.0
         σ of the gyro's misalignments, rad, by entry of its error matrix; zeros on the diagonal.
+    gyro_symmetric : bool, default False
+        Whether that matrix is symmetric: a pair of equal misalignments is one state.
     gyro_force_sigma : float or tuple (3,), default 0.0
         σ of the gyro's sensitivity to specific force along the same axis, rad/s per m/s², by axis.
     gyro_cross_force_sigma : float or tuple (3, 3), default 0.0
@@ -187,6 +189,7 @@ class States(ByValue):
 
     gyro_scale_sigma: Entries = 0.0
     gyro_misalignment_sigma: Entries = 0.0
+    gyro_symmetric: bool = False
     gyro_force_sigma: Entries = 0.0
     gyro_cross_force_sigma: Entries = 0.0
     gyro_temperature_sigma: Entries = 0.0
@@ -227,7 +230,7 @@ class States(ByValue):
         blocks: list[ErrorStates] = []
         if np.any(self.gyro_scale_sigma) or np.any(self.gyro_misalignment_sigma):
             scale, misalignment = np.asarray(self.gyro_scale_sigma), np.asarray(self.gyro_misalignment_sigma)
-            blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
+            blocks.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment, symmetric=self.gyro_symmetric))
         if np.any(self.gyro_force_sigma) or np.any(self.gyro_cross_force_sigma):
             along, across = np.asarray(self.gyro_force_sigma), np.asarray(self.gyro_cross_force_sigma)
             blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
@@ -330,6 +333,7 @@ _SPEED: tables.Choice = (("m_per_s", 1.0),)
 FORM: tables.Form = {
     "gyro_scale_sigma": tables.PPM,
     "gyro_misalignment_sigma": tables.MILLIRADIANS,
+    "gyro_symmetric": tables.FLAG,
     "gyro_force_sigma": _FORCE,
     "gyro_cross_force_sigma": _FORCE,
     "gyro_temperature_sigma": (
