@@ -919,6 +919,35 @@ def test_tilt_and_heading_are_scaled_up_to_their_limits(heading_scale, monkeypat
 
 
 @pytest.mark.parametrize("smooth", [False, True])
+def test_without_a_magnetometer_heading_and_bias_are_scaled_by_what_has_not_shown_the_bias(smooth):
+    """The reported variances over those with a scale of 1, of a unit that moves, then rests: the bias is unknown, then measured."""
+    unit = dataclasses.replace(ahrs.HAND_HELD_WITHOUT_MAGNETOMETER, tilt_sigma=0.0, tilt_scale=1.0)
+    plain, scaled = (
+        ahrs.estimate(
+            dataclasses.replace(recording(noise=1.0), magnetic_field=None),
+            dataclasses.replace(unit, heading_scale=scale),
+            latency=0.0,
+            full_covariance=True,
+            smooth=smooth,
+        ).estimate
+        for scale in (1.0, 12.0)
+    )
+    share = plain.variance[:, 3:].sum(axis=1) / (3.0 * unit.bias_sigma**2)
+    factor = 1.0 + 11.0 * np.minimum(share, 1.0)
+    assert np.ptp(factor) > (0.0 if smooth else 5.0)
+    np.testing.assert_allclose(scaled.variance[:, 3:], factor[:, None] * plain.variance[:, 3:], rtol=1e-9)
+    R = quaternion.to_matrix(plain.attitude)
+    vertical = [(R @ each.covariance[:, :3, :3] @ R.transpose(0, 2, 1))[:, 2, 2] for each in (plain, scaled)]
+    np.testing.assert_allclose(vertical[1] / vertical[0], factor, rtol=1e-3)  # but for the timing error
+    with_bias = [R @ each.covariance[:, :3, 3:] for each in (plain, scaled)]
+    both = (
+        np.sqrt(factor)[:, None, None]
+        * np.stack([np.ones_like(factor), np.ones_like(factor), np.sqrt(factor)], 1)[:, :, None]
+    )
+    np.testing.assert_allclose(with_bias[1], both * with_bias[0], rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
 def test_the_accelerometers_own_error_is_part_of_the_tilts_sigma(smooth):
     """0.5 m/s² over gravity about both level axes, and nothing else."""
     level = []
@@ -1100,15 +1129,12 @@ def test_scales_follow_the_density():
     """With its power 5/4; that of the heading up to a limit online, and that of all innovations without."""
     density = np.array([0.0, 1e-3, 0.3, 1.0, 50.0])
     tilt, heading = np.empty((2, len(density)))
-    constants = regions.scales_of(
-        dataclasses.replace(ahrs.HAND_HELD, tilt_scale=7.0, heading_scale=2.0), magnetometer=True
-    )
+    constants = regions.scales_of(dataclasses.replace(ahrs.HAND_HELD, tilt_scale=7.0, heading_scale=2.0))
     compiled(recording_steps.scale_factors)(
         read_only(density), read_only(density[::-1].copy()), constants, tilt, heading
     )
     np.testing.assert_allclose(tilt, np.sqrt(7.0 * density**1.25), rtol=1e-14)
     np.testing.assert_allclose(heading, np.sqrt(np.minimum(2.0 * density[::-1] ** 1.25, 38.0)), rtol=1e-14)
-    assert regions.scales_of(ahrs.HAND_HELD, magnetometer=False).heading == 1.0  # there are no innovations that show it
 
 
 @pytest.mark.parametrize("smooth", [False, True])

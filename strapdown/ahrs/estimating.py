@@ -285,7 +285,7 @@ def _at_stamps(
             late=delays.gyro,
             ahead=read_only(ahead),
         ),
-        regions.limits(parameters, delays.sigma),
+        regions.limits(parameters, delays.sigma, magnetometer=prepared.field is not None),
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))

@@ -177,7 +177,7 @@ class LiveAhrs:
         """Return the arguments of the kernels of a recording, for one step or one stamp."""
         parameters, a, r = self.parameters, imu.arrays, read_only
         of_force, of_field = map(regions.averages, (max(parameters.step, self.interval), parameters.heading_interval))
-        scales = regions.scales_of(parameters, magnetometer=self.magnetometer)
+        scales = regions.scales_of(parameters)
         estimate = imu.attitude, imu.bias, imu.variance, imu.covariance
         at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
         stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
@@ -191,7 +191,12 @@ class LiveAhrs:
             end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
             judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
             scale=(r(a.force_density), r(a.field_density), scales, a.tilt, a.heading),
-            carry=(at_step, stamps, regions.limits(parameters, delay_sigma), self._found),
+            carry=(
+                at_step,
+                stamps,
+                regions.limits(parameters, delay_sigma, magnetometer=self.magnetometer),
+                self._found,
+            ),
             average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
             head=(constants, headings.kernel.Steps(*map(r, of_step)), self._memory, headings.kernel.Outputs(*heading)),
             judge_field=(r(a.field_innovation), of_field, a.field_averages, a.field_density),

@@ -78,9 +78,11 @@ class AhrsParameters:
         σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
     tilt_scale, heading_scale : float, default 5.0, 3.5
         Reported variance of tilt and heading relative to that of the filter if the innovations of the accelerometer or of the magnetometer
-        are white; in others it follows their spectral density at low frequency with the power 5/4 (:mod:`strapdown.ahrs.regions`).
+        are white; in others it follows their spectral density at low frequency with the power 5/4 (:mod:`strapdown.ahrs.regions`). Without
+        a magnetometer ``heading_scale`` is the factor on the variances of heading and bias before anything has shown the bias.
     gyro_scale_sigma : float, default 0.0
-        σ of each of the gyro's scale factor errors, dimensionless, and misalignments, rad; 0: no states.
+        σ of each entry of the gyro's matrix of scale factors and misalignments, dimensionless; 0: no states. Its symmetric part has
+        states. The other part, a rotation relative to the accelerometer's axes, is zero for sensors on one chip.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
         σ of the slope of the gyro's bias over temperature, each axis, rad/s/K; 0: no states.
     """
@@ -148,7 +150,8 @@ class AhrsParameters:
             )
         states = States(
             gyro_scale_sigma=self.gyro_scale_sigma,
-            gyro_misalignment_sigma=self.gyro_scale_sigma,
+            gyro_misalignment_sigma=self.gyro_scale_sigma / np.sqrt(2.0),
+            gyro_symmetric=True,
             gyro_temperature_sigma=self.gyro_temperature_sigma,
             sensors=sensors,
         )
@@ -210,11 +213,17 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     velocity_time=1.0,
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
-    tilt_scale=5.0,
+    tilt_scale=5.5,
+    heading_scale=12.0,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the
 vertical, which nothing else shows. Chosen on the same recordings, without their magnetometers, and on those of EuRoC and TUM-VI."""
+SMOOTHED = {
+    HAND_HELD: HAND_HELD_SMOOTHED,
+    HAND_HELD_WITHOUT_MAGNETOMETER: replace(HAND_HELD_WITHOUT_MAGNETOMETER, tilt_scale=8.0),
+}
+"""Parameters of the smoother for those of the filter; without a magnetometer only the reported σ differs."""
 _VEHICLE = {"specific_force_noise": 0.15, "velocity_sigma": 8.0, "velocity_time": 10.0, "acceleration_time": 2.0}
 _VESSEL = {"velocity_sigma": 3.0, "velocity_time": 10.0, "acceleration_time": 2.0, "position_time": 10.0}
 MOTIONS: dict[str, tuple[AhrsParameters, AhrsParameters]] = {
@@ -236,4 +245,4 @@ acceleration lasts for seconds and could be mistaken for tilt; of a vessel on wa
 def of_motion(motion: str, *, magnetometer: bool, smooth: bool = False) -> AhrsParameters:
     """Return the parameters of a kind of motion, with a magnetometer or without, for the filter or the smoother."""
     parameters = MOTIONS[one_of("motion", motion, MOTIONS)][0 if magnetometer else 1]
-    return HAND_HELD_SMOOTHED if smooth and parameters is HAND_HELD else parameters
+    return SMOOTHED.get(parameters, parameters) if smooth else parameters

@@ -3,8 +3,10 @@
 One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. An
 estimate that averages many measurements errs by the slow part of their errors: for innovations that are not white its variance follows
 their spectral density at low frequency. That of the accelerometer's level innovations scales the variance of the tilt, and that of the
-magnetometer the variance of the heading. The scales were chosen so that the 95 % regions hold on the development halves of eight sets
-(``benchmarks/recordings.py``); the estimate does not depend on them. The factors apply to the variance of a settled filter.
+magnetometer the variance of the heading. Without a magnetometer the variances of heading and bias are scaled by as much of the bias as
+nothing has shown yet: of some phones it is many times the σ that gives the least error. The scales were chosen so that the 95 % regions
+hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend on them. The factors apply to the
+variance of a settled filter.
 """
 
 from __future__ import annotations
@@ -68,16 +70,16 @@ def scales(filtered: Estimate, parameters: AhrsParameters, interval: float, *, c
     force = density(filtered, "accelerometer", interval, causal=causal)
     field = density(filtered, "magnetometer", parameters.heading_interval, causal=causal)
     tilt, heading = np.empty((2, len(force)))
-    constants = scales_of(parameters, magnetometer="magnetometer" in filtered.innovations)
+    constants = scales_of(parameters)
     if not causal:
         constants = constants._replace(max_heading=math.inf)
     compiled(recording_steps.scale_factors)(read_only(force), read_only(field), constants, tilt, heading)
     return tilt, heading
 
 
-def scales_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_steps.Scales:
-    """Return the constants for the kernel; without a magnetometer the variance of the heading is the filter's own."""
-    return recording_steps.Scales(parameters.tilt_scale, parameters.heading_scale if magnetometer else 1.0, MAX_HEADING)
+def scales_of(parameters: AhrsParameters) -> recording_steps.Scales:
+    """Return the constants for the kernel."""
+    return recording_steps.Scales(parameters.tilt_scale, parameters.heading_scale, MAX_HEADING)
 
 
 def density(filtered: Estimate, sensor: str, interval: float, *, causal: bool) -> Array:
@@ -113,7 +115,7 @@ def first_memory(number: int, interval: float) -> Array:
     return np.array([0.0] * (number + 1) + [first * weight, weight])
 
 
-def limits(parameters: AhrsParameters, delay_sigma: float) -> recording_steps.Limits:
+def limits(parameters: AhrsParameters, delay_sigma: float, *, magnetometer: bool) -> recording_steps.Limits:
     """Return the constants of the covariance at the stamps, whose delay has that σ, s.
 
     σ of a tilt known from the specific force at rest is the limit for the tilt, and that of the heading in the steepest field for it.
@@ -121,5 +123,9 @@ def limits(parameters: AhrsParameters, delay_sigma: float) -> recording_steps.Li
     tilt = parameters.attitude_sigma**2
     accelerometer = (parameters.tilt_sigma / STANDARD_GRAVITY) ** 2
     return recording_steps.Limits(
-        timing=delay_sigma**2, tilt=tilt, heading=tilt / MIN_LEVEL, accelerometer=accelerometer
+        timing=delay_sigma**2,
+        tilt=tilt,
+        heading=tilt / MIN_LEVEL,
+        accelerometer=accelerometer,
+        bias=0.0 if magnetometer else parameters.bias_sigma**2,
     )

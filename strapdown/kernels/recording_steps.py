@@ -193,6 +193,8 @@ class Limits(NamedTuple):
     """Variances, rad², up to which the factors apply."""
     accelerometer: float
     """Variance of the tilt by the accelerometer's own error, rad², in addition."""
+    bias: float
+    """Initial variance of the gyro's bias, (rad/s)²: the factor applies to heading and bias by the share that is left; 0: with a field."""
 
 
 def limited(factor, variance, limit):
@@ -226,7 +228,10 @@ def carry_to_stamps(steps, stamps, limits, out):
         R = rotation_matrix(begin)
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
         sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt)
-        h = limited(steps.heading[k], zz, limits.heading)
+        if limits.bias > 0.0:  # nothing but the gyro shows the heading, whose error is mainly that of the bias
+            h = b = limited(steps.heading[k], 3.0 * limits.bias, P[3, 3] + P[4, 4] + P[5, 5])
+        else:
+            h, b = limited(steps.heading[k], zz, limits.heading), 1.0
         floor, iron = limits.accelerometer, steps.iron[k]
         x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
         level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
@@ -234,7 +239,8 @@ def carry_to_stamps(steps, stamps, limits, out):
         fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz + iron))
         across = multiply(R, block_at(P, 3))
         first_row, second_row = across[:3], across[3:6]
-        across = combine(sx, first_row, sm, second_row) + combine(sm, first_row, sy, second_row) + scale(h, across[6:])
+        level_rows = combine(b * sx, first_row, b * sm, second_row) + combine(b * sm, first_row, b * sy, second_row)
+        across = level_rows + scale(b * h, across[6:])
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
@@ -248,7 +254,7 @@ def carry_to_stamps(steps, stamps, limits, out):
             store_row(out.bias, n, bias)
             store_row(out.variance, n, (own[0], own[4], own[8]))
             for i in range(3, 6):
-                out.variance[n, i] = steps.variance[k, i]
+                out.variance[n, i] = b * b * steps.variance[k, i]
             if n < len(out.covariance):
                 mixed = multiply(transpose(R), across)
                 for i in range(3):
@@ -256,7 +262,7 @@ def carry_to_stamps(steps, stamps, limits, out):
                         out.covariance[n, i, j] = own[3 * i + j]
                         out.covariance[n, i, 3 + j] = mixed[3 * i + j]
                         out.covariance[n, 3 + j, i] = mixed[3 * i + j]
-                        out.covariance[n, 3 + i, 3 + j] = P[3 + i, 3 + j]
+                        out.covariance[n, 3 + i, 3 + j] = b * b * P[3 + i, 3 + j]
 
 
 class Scales(NamedTuple):
