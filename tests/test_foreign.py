@@ -212,6 +212,19 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
     assert "the file declares that its covariance is of the body error" in said
 
 
+def test_sigma_that_are_upper_bounds_remain_so_with_another_truth(run, files, tmp_path, monkeypatch, capsys):
+    """σ five times too large contradict a filter, except that of a recording (``motion``), with the truth inside the file or beside it."""
+    for motion, verdict in (("hand", "cannot tell"), ("", "not consistent")):
+        cautious = replace(run.estimate, covariance=25.0 * run.estimate.covariance, motion=motion)
+        setup.write_estimate(tmp_path / "cautious.h5", cautious)
+        said = command(
+            monkeypatch, capsys, "check", tmp_path / "cautious.h5", "--truth", files / "record.h5"
+        )[1]  # fmt: skip
+        assert consistency.judge(cautious, run.record.truth).verdict == verdict
+        assert f"{verdict}: " in said
+        assert ("σ are upper bounds" in said) == bool(motion)
+
+
 def test_the_reference_of_a_broad_trial_is_a_truth(tmp_path):
     attitude = Rotation.random(50, random_state=0).as_quat(scalar_first=True)
     attitude[7:9] = np.nan

@@ -203,6 +203,7 @@ def check_attitudes(
         series_of("", own.seconds(origin), own.attitude, own.covariance, own.bias),
         series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement),
         own.innovations,
+        own.motion,
         declared,
         align,
         how,
@@ -216,6 +217,7 @@ def _checked(
     own: Series,
     theirs: Series,
     innovations: Mapping[str, Innovations],
+    motion: str,
     error_frame: str,
     align: str | Iterable[str],
     how: Mapping[str, Any],
@@ -245,6 +247,7 @@ def _checked(
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         turned = None if own.bias is None else quaternion.rotate(body, own.bias)
         estimate = Estimate.from_arrays(own.time, aligned, readings[frame], bias=turned, innovations=innovations)
+        estimate = replace(estimate, motion=motion)
         judgement = judge(estimate, truth, **how)
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))

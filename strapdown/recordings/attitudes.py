@@ -54,6 +54,9 @@ class Attitudes:
         Innovations by sensor; times in s since the first stamp.
     movement : ndarray (m,) of bool, optional
         Whether the unit moved, if the file states it.
+    motion : str, default ""
+        Model of the motion, if the attitudes are an estimate of this package for a recording: its σ are then upper bounds
+        (:class:`strapdown.records.Estimate`).
     remarks : tuple of str, default empty
         Choices of the reader.
     """
@@ -66,6 +69,7 @@ class Attitudes:
     bias: Array | None = None
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     movement: NDArray[np.bool_] | None = None
+    motion: str = ""
     remarks: tuple[str, ...] = ()
 
     @classmethod
