@@ -2,6 +2,8 @@
 
 import io
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -50,6 +52,24 @@ def test_help_shows_options_in_groups_and_examples_that_parse(run):
     assert places == sorted(places)
     for unit in (*recordings.RATE_UNITS, *recordings.FORCE_UNITS, *recordings.TIME_UNITS):
         assert unit in said
+
+
+def test_a_command_whose_reader_has_left_still_writes_its_files(tmp_path):
+    """As ``strapdown coning-budget … | head`` does: nothing can be printed, and the file is whole."""
+    (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg,phase_deg\n20,0.02,90\n")
+    ending, beginning = os.pipe()
+    os.close(ending)
+    arguments = ["coning-budget", "--psd", "lines.csv", "--rate", "1000", "--json", "budget.json"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "strapdown", *arguments],
+        cwd=tmp_path,
+        stdout=beginning,
+        stderr=subprocess.PIPE,
+        check=False,
+    )
+    os.close(beginning)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert json.loads((tmp_path / "budget.json").read_text())
 
 
 def test_unknown_commands_and_options_end_with_status_2(refusal, tmp_path):

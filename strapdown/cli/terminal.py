@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import functools
 import inspect
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -55,6 +56,12 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text with options in its hints and a mark in place of each control character."""
         return super().render_str(Hint.replaced(text, option).translate(_CONTROL), **options)
+
+    def on_broken_pipe(self) -> None:
+        """Print nothing more and go on, so that a command whose output goes to ``head`` still writes its files."""
+        self.quiet = True
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # for what Python flushes at the end
 
 
 app = typer.Typer(
