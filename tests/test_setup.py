@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from measured import series_of
 
-from strapdown import coning, estimation, quaternion, records, scenarios, units, workflows
+import strapdown as sd
+from strapdown import coning, estimation, montecarlo, quaternion, records, scenarios, units, vectors, workflows
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
@@ -178,6 +179,24 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
     assert "flicker" not in words
+
+
+def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
+    tracker = vectors.AttitudeSensor(
+        name="tracker", sigma_across=1e-4, sigma_about=4e-4, rate=1.0, faults=vectors.Faults(outlier_probability=0.1)
+    )
+    faulty = scenario(sensors=(tracker,), duration=20.0)
+    record = scenarios.simulate(faulty, 1)
+    plain = setup.FilterSetup.for_scenario(faulty)
+    for change, outliers in (
+        ({}, ("the outliers of the tracker",)),
+        ({"gate": Gate(probability=0.999)}, ()),
+        ({"robust": Robust()}, ()),
+    ):
+        changed = dataclasses.replace(plain, **change)
+        assert setup.for_record.unmodelled_errors(record.origin, changed) == outliers
+        assert montecarlo.Plan(scenario=faulty, setup=changed, epochs=20).unmodelled == outliers
+        assert ("outliers" in " ".join(sd.estimate(record, **change).remarks)) == bool(outliers)
 
 
 def test_smoothing_by_a_setup_is_that_of_the_smoother():

@@ -201,7 +201,13 @@ class Plan:
     def unmodelled(self) -> tuple[str, ...]:
         """Errors, in words, that the scenario specifies and the filter has no state for."""
         scenario = self.scenario
-        return setup.unmodelled_errors(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
+        return setup.unmodelled_errors(
+            scenario.gyro,
+            scenario.sensors,
+            self.setup.states,
+            gravity_f=scenario.gravity_f,
+            rejects=self.setup.rejects,
+        )
 
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of strings and numbers, for comparison and for :func:`from_table`.

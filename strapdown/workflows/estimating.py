@@ -215,8 +215,7 @@ def _run_record(
     """Run the filter over a record; ``changes``: the gate and the weights."""
     if smooth and count("every", every) > 1:
         raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
-    filter_setup, notes = filter_for_record(record, noise, setup, initial, states)
-    filter_setup = dataclasses.replace(filter_setup, **changes)
+    filter_setup, notes = filter_for_record(record, noise, setup, initial, states, changes)
     modelled = setups.modelled_record(record, filter_setup)
     if every > len(modelled.increments):
         raise InputError(

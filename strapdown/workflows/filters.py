@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,16 +54,20 @@ def filter_for_record(
     setup: FilterSetup | None,
     initial: State | ArrayLike | str | None,
     states: bool | Sequence[str] | None,
+    changes: Mapping[str, Any],
 ) -> tuple[FilterSetup, list[str]]:
-    """Return the filter for a record, and remarks on its error states and on errors that it does not model."""
+    """Return the filter for a record, and remarks on errors and their states; ``changes``: fields of the filter beside them."""
     if setup is not None:
         remedy = "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
         instance("setup", setup, FilterSetup, remedy)
         need_alone(noise, states)
         need_angles(setup, record)
+        setup = dataclasses.replace(setup, **changes)
         return setup, no_state_words(for_record.unmodelled_errors(record.origin, setup), setup)
     if not isinstance(noise, ProcessNoise):
-        return matched_filter(record, None if noise is None else specification_of(noise), states=states)
+        return matched_filter(
+            record, None if noise is None else specification_of(noise), states=states, changes=changes
+        )
     if not isinstance(initial, State):
         raise InputError(
             "noise is a ProcessNoise, which has no σ of the initial gyro bias; give initial= too, or a GyroSpec as noise"
@@ -74,7 +78,10 @@ def filter_for_record(
         )
     sigma = np.sqrt(np.diag(initial.covariance))
     return FilterSetup(
-        process_noise=noise, attitude_sigma=float(np.max(sigma[:3])), bias_sigma=float(np.max(sigma[3:6]))
+        process_noise=noise,
+        attitude_sigma=float(np.max(sigma[:3])),
+        bias_sigma=float(np.max(sigma[3:6])),
+        **changes,
     ), []
 
 
@@ -98,10 +105,14 @@ def need_angles(setup: FilterSetup, record: ImuRecord) -> None:
 
 
 def matched_filter(
-    record: ImuRecord, spec: GyroSpec | None = None, *, states: bool | Sequence[str] | None = None
+    record: ImuRecord,
+    spec: GyroSpec | None = None,
+    *,
+    states: bool | Sequence[str] | None = None,
+    changes: Mapping[str, Any] | None = None,
 ) -> tuple[FilterSetup, list[str]]:
-    """Return the filter that matches a record's specifications, and remarks on its error states and on errors without one."""
-    filter_setup = setups.FilterSetup.for_record(record, spec, states=states)
+    """Return the filter that matches a record's specifications, with ``changes`` of its fields, and remarks on errors and their states."""
+    filter_setup = dataclasses.replace(setups.FilterSetup.for_record(record, spec, states=states), **(changes or {}))
     missing = for_record.unmodelled_errors(record.origin, filter_setup)
     if states is False or (states is None and filter_setup.states is None):
         return filter_setup, no_state_words(missing, filter_setup)

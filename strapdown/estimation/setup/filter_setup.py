@@ -103,6 +103,11 @@ class FilterSetup(ByValue):
             )
 
     @property
+    def rejects(self) -> bool:
+        """Whether a gate or robust weights keep outliers out."""
+        return self.gate is not None or self.robust is not None
+
+    @property
     def estimator_name(self) -> str:
         """Name of the estimator."""
         return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)

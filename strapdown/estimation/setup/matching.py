@@ -195,10 +195,12 @@ def unmodelled_errors(
     states: States | None = None,
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
+    rejects: bool = False,
 ) -> tuple[str, ...]:
     """Return the specified errors of gyro and sensors for which a filter has no state, as texts with their size.
 
-    If there are any, the covariance of a filter that models only the noise is too small.
+    If there are any, the covariance of a filter that models only the noise is too small. With ``rejects``, the
+    filter has a gate or robust weights, and outliers are left out.
 
     Examples
     --------
@@ -238,7 +240,7 @@ def unmodelled_errors(
             ),
             (accelerated, f"{name}.velocity", f"the acceleration of the point where the {name} is mounted"),
             (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
-            (faults.outlier_probability, "", f"the outliers of the {name}"),
+            (not rejects and faults.outlier_probability, "", f"the outliers of the {name}"),
         ]
     known = () if states is None else states.names
     return tuple(words for size, state, words in terms if np.any(size) and state not in known)
