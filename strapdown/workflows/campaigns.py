@@ -39,7 +39,7 @@ def plan(
         need_alone(gyro, states)
         setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=False), estimator=setup)
     filter_setup = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
-    names = filter_setup.states.names if setup is None and filter_setup.states is not None else ()
+    names = () if filter_setup.states is None else filter_setup.states.names
     return montecarlo.Plan(
         scenario=scenario,
         setup=filter_setup,
