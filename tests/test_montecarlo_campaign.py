@@ -394,6 +394,29 @@ def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(
     assert 0.65 < np.std(ratio) < 1.4
 
 
+def test_it_also_does_so_if_the_filter_with_the_states_is_in_a_file(command):
+    Path("f.toml").write_text(setups.to_toml(setups.FilterSetup.for_scenario(SCENARIO, states=True)))
+    _, said, _ = command("short.toml", "--runs", 4, "--filter", "f.toml", *SCALAR)
+    assert "Each run draws its own gyro" in said
+    assert campaign.read("short-montecarlo.h5").plan.individuals
+
+
+def test_a_file_in_which_no_run_was_finished_does_not_stand_in_the_way(tmp_path):
+    """As after a fault in a filter of one's own, which is found in the first run; a file of another kind is kept."""
+    path = tmp_path / "c.h5"
+
+    def faulty(record, initial):
+        raise ValueError("a mistake")
+
+    with pytest.raises(ValueError, match="a mistake"):
+        go(path, 4, plan=replace(PLAN, setup=replace(SETUP, estimator=faulty)))
+    assert campaign.read(path).finished_runs == 0
+    assert go(path, 4).finished
+    path.write_text("a report")
+    with pytest.raises(InputError, match="exists"):
+        go(path, 4)
+
+
 def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
     Path("f.toml").write_text(setups.to_toml(replace(SETUP, measurement_sigma_factor=0.5)))
     Path("d.toml").write_text("[dispersions]\nattitude_error_deg = [0.0, 0.0, 5.0]\nattitude_sigma_deg = 0.0\n")

@@ -207,12 +207,13 @@ def run(
     Raises
     ------
     InputError
-        If the file exists without ``resume`` or ``overwrite``, is of another plan, or is no campaign.
+        If the file exists without ``resume`` or ``overwrite``, except a campaign without a finished run, is of another plan, or is no
+        campaign.
     """
     target = Path(path)
     count("runs", runs)
     table = plan.to_table()
-    if target.exists() and not resume and not overwrite:
+    if not resume and not overwrite and _has_runs(target):
         raise InputError(
             f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
@@ -242,6 +243,14 @@ def run(
             stop_if_asked()
 
         return _compute(start, target, table, in_threads(threads) if workers is None else workers, advanced)
+
+
+def _has_runs(path: Path) -> bool:
+    """Return whether there is a file that a new campaign would destroy: any but a campaign of which no run is finished."""
+    try:
+        return path.exists() and read(path).finished_runs > 0
+    except InputError:
+        return True
 
 
 @contextlib.contextmanager
