@@ -730,6 +730,8 @@ def test_an_alignment_is_described_with_its_sigma():
     described = alignment.Alignment(offset=1.5, fixed=fixed, body=body, sigma=sigma, **known)
     clock, *frames = described.words
     assert clock.startswith("clocks differ by 1.5 s ± 0.25 s")
+    epoch = replace(described, offset=1_700_000_000.1234)
+    assert epoch.words[0].startswith("clocks differ by 1700000000.12 s ± 0.25 s")
     assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° an axis")
     assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° an axis")
     *numbers, residual = [value for key, value in described.summary().items() if key != "removed"]

@@ -62,8 +62,10 @@ class Alignment:
         """Differences that were removed, one sentence each."""
         words = []
         if "time" in self.estimated:
+            # One clock may count from 1970: at least to a tenth of σ.
+            digits = max(6.0, 2.0 + np.ceil(np.log10(max(abs(self.offset), 1e-9) / max(self.sigma[6], 1e-9))))
             words.append(
-                f"clocks differ by {self.offset:.6g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
+                f"clocks differ by {self.offset:.{int(digits)}g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
             )
         for name, rotation, rows in (("fixed", self.fixed, slice(0, 3)), ("body", self.body, slice(3, 6))):
             if name in self.estimated:
