@@ -228,6 +228,7 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
     ("changes", "message"),
     [
         ({"plan": replace(PLAN, seed=5)}, "seed is 4 there and 5 here"),
+        ({"plan": replace(PLAN, seed=0)}, "seed is 4 there and 0 here"),
         ({"plan": replace(PLAN, nis_bins=4)}, "nis_bins is 5 there and 4 here"),
         ({"plan": replace(PLAN, setup=replace(SETUP, attitude_sigma=0.1))}, "filter.attitude_sigma_deg is"),
         ({"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8))}, "scenario.duration_s is 2.4 there and 4.8"),

@@ -325,9 +325,11 @@ def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: in
         if wanted.get(name) != there.get(name):
             of_code = name in ("version", "sources")
             remedy = "continue it with the strapdown that began it" if of_code else "give the value in the file"
+            held_value, value = (
+                "not given" if table.get(name) in (None, "") else table[name] for table in (there, wanted)
+            )
             raise InputError(
-                f"{target} is of another campaign; {name} is {there.get(name) or 'not given'} there and {wanted.get(name) or 'not given'} "
-                f"here; {remedy}, or choose another file"
+                f"{target} is of another campaign; {name} is {held_value} there and {value} here; {remedy}, or choose another file"
             )
     if runs < held.finished_runs:
         raise InputError(
