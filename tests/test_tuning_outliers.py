@@ -16,7 +16,7 @@ from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
-from strapdown.tuning import innovations, outliers
+from strapdown.tuning import fitting, innovations, outliers
 
 
 def scenario(duration: float = 200.0, share: float = 0.05) -> scenarios.Scenario:
@@ -271,6 +271,19 @@ def test_five_in_a_hundred_ten_times_as_wide_are_found_from_wrong_parameters():
         assert gate.lower < gate.probability < gate.upper
         assert np.log((1.0 - gate.probability) / (1.0 - right)) == pytest.approx(0.0, abs=0.5)
         assert 11.0 < gate.thresholds["star 1"] < 16.0
+
+
+def test_the_gate_is_described_by_the_share_that_it_refuses():
+    """Of 1e-5: the share that it accepts would be printed as 100 %."""
+    share = fitting.Estimated(
+        name="outliers.share", unit="", start=0.02, value=0.01, most_likely=0.01, lower=0.008, upper=0.012, standard_error=0.1,
+        identified=True, note="",
+    )  # fmt: skip
+    described = outliers.TunedGate(
+        gate=Gate(probability=1.0 - 1e-5), probability=1.0 - 1e-5, lower=1.0 - 4e-5, upper=1.0 - 2e-6, thresholds={"st": 25.0},
+        share=share, scale=share,
+    )  # fmt: skip
+    assert described.words.endswith("The gate refuses 0.001 % of valid measurements (95 %: 0.0002 to 0.004).")
 
 
 @pytest.mark.slow

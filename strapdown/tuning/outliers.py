@@ -84,9 +84,10 @@ class TunedGate:
             why = "no outliers" if not self.share.identified else "noise of two sizes rather than outliers"
             return f"The records show {why}; the filter's gate is unchanged."
         thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in self.thresholds.items())
+        refused, least, most = (100.0 * (1.0 - p) for p in (self.probability, self.upper, self.lower))
         return (
-            f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate accepts "
-            f"{100.0 * self.probability:.4g} % of valid measurements (95 %: {100.0 * self.lower:.4g} to {100.0 * self.upper:.4g})."
+            f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate refuses "
+            f"{refused:.2g} % of valid measurements (95 %: {least:.2g} to {most:.2g})."
         )
 
 
