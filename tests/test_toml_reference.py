@@ -155,6 +155,9 @@ def test_the_keys_are_printed_by_section():
     assert all(section.header in every for section in SECTIONS)
     with pytest.raises(InputError, match=r"no section 'gyros' .* name one of top, motion, gyro, sensors"):
         keys.named("gyros")
+    with pytest.raises(InputError, match=r"harmonic-rates, motion\.harmonics, .*temperature.*, sensors\.orbit$"):
+        keys.named("gyros")
+    assert [section.header for section in keys.named("harmonics")] == ["[[motion.harmonics]]"]
 
 
 SYMBOLS = {"": "", "degc": "°C", "kg_m2": "kg m²", "rad_s_per_m": "rad s/m", "deg_per_hour_per_hour": "°/h²"}
