@@ -181,6 +181,12 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
     assert "flicker" not in words
 
 
+@pytest.mark.parametrize("name", ["mine.py:textbook", "folder.x/mine.py"])
+def test_a_python_file_is_no_setup(name):
+    with pytest.raises(InputError, match=f"{name} is a filter of your own, .* give a TOML file"):
+        setup.read_setup(name)
+
+
 def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
     tracker = vectors.AttitudeSensor(
         name="tracker", sigma_across=1e-4, sigma_about=4e-4, rate=1.0, faults=vectors.Faults(outlier_probability=0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from strapdown import coning, gyro
@@ -122,4 +123,6 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     FilterSetup
         Setup of the table, in SI units and radians.
     """
+    if ".py" in (Path(path).suffix, Path(path).name.partition(":")[0][-3:]):
+        raise InputError(f"{path} is a filter of your own, which only a Monte Carlo runs; give a TOML file here")
     return tables.read(path, "filter", "`strapdown tune` writes one", from_table)
