@@ -334,7 +334,10 @@ def instance(name: str, value: object, wanted: type | tuple[type, ...], remedy: 
     """Raise an error if a value is not of a class, or of one of several; ``remedy`` ends the message."""
     if not isinstance(value, wanted):
         classes = " or ".join(kind.__name__ for kind in (wanted if isinstance(wanted, tuple) else (wanted,)))
-        raise InputError(f"{name} is {reprlib.repr(value)}, not of class {classes}; {remedy}")
+        # An object of this package is described by several lines.
+        plain = value is None or isinstance(value, (str, int, float, complex, list, tuple, dict, set, type, np.ndarray))
+        what = reprlib.repr(value) if plain else f"of class {type(value).__name__}"
+        raise InputError(f"{name} is {what}, not of class {classes}; {remedy}")
 
 
 def known_keys(place: str, keys: Iterable[str], known: Iterable[str]) -> None:

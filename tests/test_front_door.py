@@ -292,6 +292,13 @@ def test_what_is_none_of_these_things_is_refused_in_words(call):
         call()
 
 
+def test_a_refused_object_is_named_by_its_class_and_a_text_in_place_of_names_as_such():
+    with pytest.raises(sd.InputError, match="content is of class GyroSpec, not of class ImuRecord or Recording"):
+        sd.write(scenario().gyro, "x.h5")
+    with pytest.raises(sd.InputError, match=r"states is 'gyro\.scale', a text; give .* \['gyro\.scale'\]"):
+        sd.estimate(sd.simulate(scenario(5.0)), states="gyro.scale")
+
+
 def test_check_refuses_the_truth_of_another_record():
     estimate = sd.estimate(sd.simulate(scenario(10.0)))
     with pytest.raises(sd.InputError, match="stamps"):

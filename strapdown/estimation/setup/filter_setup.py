@@ -217,6 +217,8 @@ class FilterSetup(ByValue):
         noise = ProcessNoise(**matching.noise_beside_states(spec, white))
         accurate = matching.commutes_badly(record, noise.angle_random_walk)
         if not isinstance(states, bool) and states is not None:
+            if isinstance(states, str):
+                raise InputError(f"states is {states!r}, a text; give a list of names, as in [{states!r}]")
             kept = kept.select(tuple(states)) if states else States()
         return replace(
             plain,
