@@ -17,6 +17,9 @@ from typer.main import get_command
 import strapdown
 from benchmarks import recording_parameters, recordings
 from strapdown import quaternion
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup, to_table
+from strapdown.estimation.states import ProcessNoise
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -193,6 +196,24 @@ def test_the_comparison_shows_what_the_theory_says():
     assert verdicts["GTSAM"] == verdicts["AttiPy, heading's derivative mended"] == "consistent"
     wrong = ("smsfusion", "AttiPy", "smsfusion, noises of another sensor", "GTSAM, gyro with a bias")
     assert {verdicts[name] for name in wrong} == {"not consistent"}
+
+
+def test_the_filter_file_is_described_with_its_own_keys():
+    described = (DOCS / "formats.md").read_text(encoding="utf-8").partition("## Filter\n")[2].partition("\n## ")[0]
+    shown = dict(re.findall(r"^\| `\[(filter[.a-z]*)\]` \| (.*) \|$", described, re.MULTILINE))
+    # No default, which the file would leave out.
+    setup = FilterSetup(
+        process_noise=ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-8),
+        attitude_sigma=0.1,
+        bias_sigma=1e-5,
+        measurement_sigma_factor=2.0,
+        gate=Gate(probability=0.9, recovery=5, restart_attitude_sigma=0.1, restart_bias_sigma=1e-5),
+        robust=Robust(kind="huber", probability=0.9, degrees_of_freedom=5.0, iterations=3),
+    )
+    table = to_table(setup)
+    for name, part in (("filter", table), ("filter.gate", table["gate"]), ("filter.robust", table["robust"])):
+        keys = {key for key, value in part.items() if not isinstance(value, dict)}
+        assert keys <= set(re.findall(r"`([a-z_]+)`", shown[name]))
 
 
 def test_tests_that_pages_name_exist():
