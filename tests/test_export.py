@@ -336,6 +336,23 @@ def test_sanitizers_find_nothing(name, tmp_path):
     run_sanitized({**c_files(program(name)), "main.c": SANITIZED.replace("UPDATES", updates)}, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "words"),
+    [
+        ("attitude", "sigma about body x, y, z (0.001, 0.001, 0.01) rad = (0.0573, 0.0573, 0.573) deg."),
+        ("direction", "sigma 0.02 rad = 1.146 deg."),
+    ],
+)
+def test_the_header_has_the_sigma_of_each_axis(sensor, words, tmp_path):
+    """Not the root mean square over a star tracker's axes, which differ by the factor ten."""
+    setup = sd.FilterSetup(process_noise=NOISE, attitude_sigma=0.4, bias_sigma=5e-3, gate=GATE)
+    motion = sd.motion.ConstantRate(rate=(0.01, 0.0, 0.0))
+    scenario = sd.Scenario(motion=motion, gyro=sd.GyroSpec(), sensors=(SENSORS[sensor],), rate=RATE, duration=5.0)
+    sd.export(setup, scenario, folder=tmp_path)
+    header = (tmp_path / "strapdown_filter.h").read_text(encoding="utf-8")
+    assert words in " ".join(header.replace("*", " ").split())
+
+
 def test_the_example_and_the_header_of_the_export(tmp_path):
     record, setup, _ = case("gate")
     paths = sd.export(setup, record, folder=tmp_path, precision="single")

@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.live import arrays_of
-from strapdown.checks import InputError
+from strapdown.checks import Array, InputError
 from strapdown.codegen.c import identifier
 from strapdown.codegen.program import Program, Sensor, Table
 from strapdown.codegen.recording import Recording
@@ -134,9 +134,12 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
         "attitude": "an attitude q_fb, scalar first",
     }[series.kind]
     place = "" if attitude else f" Reference in fixed axes: ({', '.join(f'{x:.6g}' for x in reference)})."
-    angle = f" = {sigma / DEGREE:.4g} deg" if sigma > 0.1 * DEGREE else f" = {sigma / ARCSECOND:.4g} arcsec"
+    axes = np.sqrt(np.diag(covariance))
+    if not attitude or np.allclose(axes, sigma):
+        axes = np.array([sigma])
+    angle = f" = {_each(axes / DEGREE, 4)} deg" if sigma > 0.1 * DEGREE else f" = {_each(axes / ARCSECOND, 4)} arcsec"
     unit = "" if series.kind == "vector" else f" rad{angle}"
-    of = " of the heading" if series.kind == "heading" else ""
+    of = {"heading": " of the heading", "attitude": " about body x, y, z" if len(axes) > 1 else ""}.get(series.kind, "")
     return Sensor(
         name=identifier(series.sensor),
         kind=KIND_CODES[series.kind],
@@ -145,8 +148,14 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
         length=length,
         noise=noise,
         variances=tuple(np.diag(covariance).tolist()),
-        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma{of} {sigma:.6g}{unit}.",
+        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma{of} {_each(axes, 6)}{unit}.",
     )
+
+
+def _each(values: Array, digits: int) -> str:
+    """Return one number, or several in brackets."""
+    numbers = ", ".join(f"{value:.{digits}g}" for value in values)
+    return numbers if len(values) == 1 else f"({numbers})"
 
 
 def _plain(model: Model) -> Model:
