@@ -144,6 +144,7 @@ def test_a_mapping_names_columns_and_units(table):
         ("tme=when", "role 'tme' is not known; did you mean 'time'"),
         ("time=when,time=u1", "time is given twice"),
         ("time=then", "has no column 'then' for time"),
+        ("time=when,gx=u1(furlong)", "the unit in 'u1(furlong)' for gx is not known (known: rad/s, deg/s"),
         ("time=when,gx=u1", "lacks gy, gz"),
     ],
 )
