@@ -145,7 +145,7 @@ function drawError(place, title, unit, unitName, { time, value, sigma }) {
   pen.lineWidth = 0.7;
   pen.strokeRect(left, top, right - left, bottom - top);
   pen.fillStyle = ink;
-  pen.fillText(`${title}, ${unitName}: error, and ±3σ of the filter`, left, 14);
+  pen.fillText(`${title}: error and ±3σ, ${unitName}`, left, 14);
   pen.textAlign = "right";
   [-1, 0, 1].forEach((part) => {
     const value = part * mark;
