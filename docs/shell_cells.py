@@ -23,7 +23,8 @@ def bash(line: str, cell: str) -> None:
         cell = CANNOT_TELL + cell
     # stderr holds progress bars; cells that show an error redirect it.
     done = subprocess.run(["bash", *options, "-c", cell], capture_output=True, text=True, check=False)
-    print("\n".join(_wrapped(row.rstrip()) for row in done.stdout.splitlines()))
+    if done.stdout:  # else an empty box on the page
+        print("\n".join(_wrapped(row.rstrip()) for row in done.stdout.splitlines()))
     if done.returncode and options:
         raise RuntimeError(f"exit status {done.returncode}: {done.stderr}")
 
