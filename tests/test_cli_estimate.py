@@ -431,7 +431,10 @@ def test_states_of_a_direction_are_printed_relative_to_its_vector(record):
     iron = records.estimate.ErrorStateEstimate(
         components=("x", "y", "z"), units=("1",) * 3, values=np.full((m, 3), 0.02), variance=np.full((m, 3), 1e-4)
     )
-    cells = dataclasses.replace(estimate, error_states={"a bias": iron, "c bias": iron}).listing().cells
+    with_states = dataclasses.replace(estimate, error_states={"a bias": iron, "c bias": iron})
+    cells = with_states.listing().cells
+    units = [ax.get_ylabel() for ax in sd.plots.states_over_time(with_states).axes]
+    assert units == ["% of the vector", "dimensionless"]
     assert [tuple(row[:4]) for row in cells[-6:] if row[0].endswith("x")] == [
         ("a bias x", "% of the vector", "2", "1"),
         ("c bias x", "dimensionless", "0.02", "0.01"),

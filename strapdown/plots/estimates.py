@@ -18,7 +18,7 @@ from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
 from strapdown.records import Estimate, Truth, outputs
-from strapdown.units import DEGREE, angle_unit, error_state_unit, rate_unit
+from strapdown.units import DEGREE, angle_unit, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""
@@ -151,7 +151,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     axes = np.atleast_1d(grid)
     settled = slice(len(estimate.time) // 10, None)
     for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
-        word, size = error_state_unit(name, unit)
+        word, size = estimate.state_unit(name, unit)
         values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
         for k, member in enumerate(members):
             color = style.CYCLE[k % len(style.CYCLE)]
