@@ -405,6 +405,14 @@ def test_a_page_is_well_formed_and_needs_nothing_else(folder, panels, name):
     assert all(all(figure) for figure in panels[name])  # something is drawn in each panel
 
 
+def test_an_estimate_without_covariance_has_no_evidence(folder, tmp_path):
+    estimate = setup.read_estimate(folder / "blind.h5")
+    unknown = np.full_like(estimate.variance, np.nan)
+    nothing = dataclasses.replace(estimate, variance=unknown, covariance=None, innovations={})
+    setup.write_estimate(tmp_path / "integrated.h5", nothing)
+    assert "Evidence" not in body(report.write(tmp_path / "integrated.h5").page)
+
+
 def test_the_verdict_comes_first_and_findings_are_called_pass_and_fail(folder):
     for name, verdict, failing in (("right", "cannot tell", False), ("wrong", "not consistent", True)):
         content = re.sub(r"<(script|style)[ >].*?</\1>", "", body(folder / f"{name}.html"), flags=re.S)
@@ -475,6 +483,8 @@ PROBE = """const wait = setInterval(async () => {
     found.reset = seen();
     const head = document.querySelector(".u-legend .u-series:not(:first-child) th");
     found.focusable = [head.tabIndex, head.getAttribute("role")];
+    const marks = (place) => [...place.querySelectorAll(".u-series:not(:first-child) .u-marker")];
+    found.marks = drawn.map(({place}) => marks(place).map((mark) => mark.style.borderStyle));
     press(head, "Enter"); await soon();
     found.pressed = head.getAttribute("aria-pressed");
     const bodies = strapdownCharts.bodies();
@@ -516,6 +526,8 @@ def test_a_browser_shows_figures_and_charts(folder, name, width):
     assert reported["visible"] == pytest.approx(0.25 * reported["samples"], rel=0.05, abs=2)
     np.testing.assert_allclose(reported["reset"], whole)  # a double click on one chart restores all of them
     assert reported["focusable"] == [0, "button"]
+    lines = [[line["dash"] for line in chart["series"]] for chart in charts_of(body(folder / f"{name}.html"))]
+    assert reported["marks"] == [["dashed" if dash else "solid" for dash in chart] for chart in lines]
     assert reported["pressed"] == "false"
     assert reported["ink"] == "#16181d"  # dark on paper, also in the dark theme
     if name == "right":

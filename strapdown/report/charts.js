@@ -68,6 +68,10 @@
       {
         width: Math.max(240, place.clientWidth),
         height: 260,
+        legend: { markers: { // as the lines are drawn
+          dash: (u, k) => (content.series[k - 1].dash ? "dashed" : "solid"),
+          fill: (u, k) => (content.series[k - 1].band ? colour("--band") : "transparent"),
+        } },
         cursor: { sync: named ? undefined : { key: content.x }, drag: { x: true, y: false } },
         scales: { x: { time: false, distr: content.log_x ? 3 : 1, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
         axes: [

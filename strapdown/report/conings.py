@@ -35,7 +35,8 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
     answer = min((row["verdict"] for row in filters), key=WORST_FIRST.index)
     passing = [row["integration"] for row in filters if row["verdict"] == "consistent"]
-    reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter: {', '.join(passing) or 'none'}"
+    reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter"
+    reason += f": {', '.join(passing)}" if passing else ""
     content = page.page(
         "Coning study",
         coning_study.words(study),

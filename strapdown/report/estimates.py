@@ -40,7 +40,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.judged(judgement),
         page.listed(estimate.listing()),
         *([] if table is None else [page.listed(table.listing())]),
-        page.section("Evidence", page.table(judgement.listing())),
+        *([page.section("Evidence", page.table(judgement.listing()))] if judgement.findings else []),
         _over_time(estimate, truth, error),
         *[_sensor(name, innovations) for name, innovations in estimate.innovations.items()],
         *_distribution(estimate, truth),
