@@ -48,9 +48,9 @@ RIGHT = FilterSetup(
 )
 FACTORS: dict[str, tuple[float, float]] = {
     "right": (1.0, 1.0),
-    "Q x 4": (4.0, 1.0),
+    "Q × 4": (4.0, 1.0),
     "Q / 4": (0.25, 1.0),
-    "R x 4": (1.0, 4.0),
+    "R × 4": (1.0, 4.0),
     "R / 4": (1.0, 0.25),
 }
 """Process noise Q and measurement noise R of the filter, as multiples of the true ones."""
@@ -145,7 +145,7 @@ def main(*, runs: int = 4000, seed: int = 1, machine: str = "auto", out: Path | 
 
 def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], runs: int) -> Any:
     """Draw NEES of attitude and bias and NIS over time, from the runs and predicted."""
-    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.6))
+    figure, axes = plots.new_figure(1, 3, size=(10.5, 4.6))
     for ax, subset in zip(axes, ("attitude", "bias", None), strict=True):
         low, high = consistency.mean_bounds(3, runs)
         ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a consistent filter")

@@ -22,9 +22,9 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 
-from strapdown import coning
+from strapdown import coning, plots
 from strapdown.coning import ALGORITHMS, Algorithm
-from strapdown.files import atomic_write, write_json
+from strapdown.files import write_json
 from strapdown.plots import style
 from strapdown.units import DEGREE
 
@@ -474,6 +474,14 @@ def manoeuvres(count: int, seed: int) -> ManoeuvreError:
 # --------------------------------------------------------------------------------------------------------------- the figures
 
 
+def _look(k: int, name: str) -> dict[str, Any]:
+    """Return the style of the line of algorithm k; the package's own are thick."""
+    if name in OWN:
+        return {"color": "k" if name == OWN[-1] else "0.5", "linewidth": 2.2}
+    number = len(style.CYCLE)
+    return {"color": style.CYCLE[k % number], "linewidth": 1.2, "linestyle": ("-", "--")[k // number % 2]}
+
+
 def draw_drift(result: Curves, axes: Any) -> None:
     """Draw drift against frequency ratio at both cone angles; closed forms are dotted."""
     shown = np.asarray(result.ratios)
@@ -484,21 +492,12 @@ def draw_drift(result: Curves, axes: Any) -> None:
         strict=True,
     ):
         for k, (name, drift) in enumerate(table.items()):
-            own = name in OWN
-            ax.loglog(
-                shown,
-                drift,
-                color=f"C{k % 10}" if not own else ("k" if name == OWN[-1] else "0.5"),
-                lw=2.2 if own else 1.2,
-                ls="-" if k < 10 or own else "--",
-                label=name,
-            )
+            ax.loglog(shown, drift, label=name, **_look(k, name))
             a = ALGORITHMS[name]
             leading = abs(float(a.drift_constant)) * angle**2 * shown**a.drift_order
             ax.loglog(shown, leading, color="0.6", lw=0.6, ls=":")
         ax.axhspan(1e-60, ROUNDING, color="0.9")
         ax.set(xlabel="frequency ratio λ = ωh", title=f"β = {angle / DEGREE:.3g}°", ylim=(1e-34, 1e-1))
-        ax.grid(alpha=0.3)
     axes[0].set_ylabel("drift / ω   (dotted: closed form; grey: below rounding)")
     axes[1].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
@@ -507,18 +506,9 @@ def draw_floor(result: Curves, ax: Any) -> None:
     """Draw drift against cone angle: second-order forms deviate from β² towards a floor that grows as β⁴."""
     angles = np.asarray(result.angles) / DEGREE
     for k, (name, drift) in enumerate(result.drift_by_angle.items()):
-        own = name in OWN
-        ax.loglog(
-            angles,
-            drift,
-            color=f"C{k % 10}" if not own else ("k" if name == OWN[-1] else "0.5"),
-            lw=2.2 if own else 1.2,
-            ls="-" if k < 10 or own else "--",
-            label=name,
-        )
+        ax.loglog(angles, drift, label=name, **_look(k, name))
     ax.axhspan(1e-60, ROUNDING, color="0.9")
     ax.set(xlabel="cone half-angle β, °", ylabel="drift / ω", title=f"λ = {result.ratio:g}", ylim=(1e-30, 1e-2))
-    ax.grid(alpha=0.3)
     ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
@@ -531,7 +521,7 @@ def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
         [c.nanoseconds for c in front],
         [c.drift for c in front],
         "o-",
-        color="C0",
+        color=style.BLUE,
         ms=5,
         label="none is both faster and more accurate",
     )
@@ -544,7 +534,6 @@ def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
             labelled.append(c)
     ax.set_xlim(left=1.0)
     ax.set(xlabel="time per sample, ns", ylabel="drift / ω", title="cost against error")
-    ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc="lower left")
 
 
@@ -556,6 +545,7 @@ def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
         best = np.min([np.abs(np.array(table[name])) for name in PUBLISHED], axis=0)
         rounding = ROUNDING / (ALGORITHMS[own].samples * ratios) if what == "drift" else np.full(len(ratios), ROUNDING)
         ratio = np.log10(np.maximum(mine, 1e-300) / np.maximum(best, 1e-300))
+        ax.grid(visible=False)
         image = ax.imshow(ratio, cmap="RdBu_r", vmin=-6, vmax=6, origin="lower", aspect="auto")
         for i, j in np.argwhere(mine < rounding):
             ax.text(j, i, "·", ha="center", va="center", fontsize=16, color="0.65")
@@ -573,53 +563,32 @@ def draw_manoeuvres(result: ManoeuvreError, ax: Any) -> None:
     published = np.array([result.errors[name] for name in PUBLISHED])
     for k, errors in enumerate(published):
         ax.loglog(ratios, errors, ".", color="0.75", ms=3, label=None if k else "each published")
-    ax.loglog(ratios, published.min(axis=0), "v", color="C3", ms=5, label="smallest published")
+    ax.loglog(ratios, published.min(axis=0), "v", color=style.ORANGE, ms=5, label="smallest published")
     for k, name in enumerate(OWN):
-        ax.loglog(ratios, result.errors[name], "o", color=f"C{k}" if k < 3 else "k", ms=3, label=name)
+        ax.loglog(ratios, result.errors[name], "o", color=style.CYCLE[k] if k < 3 else "k", ms=3, label=name)
     ax.set(
         xlabel="frequency ratio λ of the highest frequency",
         ylabel="maximum attitude error, rad",
         title="random manoeuvres, 840 samples",
     )
-    ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
 
 
 def draw(result: Result, folder: Path) -> list[Path]:
     """Write the figures into ``folder``; return their paths."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    paths = []
-
-    def saved(name: str, figure: Any) -> None:
-        path = folder / f"{name}.png"
-        style.label_alike(figure)
-        with atomic_write(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 5}):
-            figure.savefig(temporary, dpi=140, bbox_inches="tight")
-        plt.close(figure)
-        paths.append(path)
-
-    figure, axes = plt.subplots(1, 2, figsize=(13, 6), sharey=True)
+    drift, axes = plots.new_figure(1, 2, size=(10.5, 5.0), sharey=True)
     draw_drift(result.curves, axes)
-    saved("coning-drift", figure)
-    figure, ax = plt.subplots(figsize=(8, 6))
+    floor, ax = plots.new_figure(size=(8.0, 5.0))
     draw_floor(result.curves, ax)
-    saved("coning-floor", figure)
-    figure, ax = plt.subplots(figsize=(8, 6))
+    cost, ax = plots.new_figure(size=(8.0, 5.0))
     draw_costs(result.costs, ax)
-    saved("coning-cost", figure)
-    figure, axes = plt.subplots(2, 2, figsize=(13, 10))
+    comparison, axes = plots.new_figure(2, 2, size=(10.5, 8.0))
     for row, own in zip(axes, ("matched-4-11", "matched-1-8-8"), strict=True):
         draw_comparison(result.comparison, own, row)
-    figure.tight_layout()
-    saved("coning-comparison", figure)
-    figure, ax = plt.subplots(figsize=(8, 6))
+    manoeuvres, ax = plots.new_figure(size=(8.0, 5.0))
     draw_manoeuvres(result.manoeuvres, ax)
-    saved("coning-manoeuvres", figure)
-    return paths
+    figures = {"drift": drift, "floor": floor, "cost": cost, "comparison": comparison, "manoeuvres": manoeuvres}
+    return [plots.save(figure, folder / f"coning-{name}.png") for name, figure in figures.items()]
 
 
 def main(*, out: str | Path | None = None, quick: bool = False, seed: int = 1) -> Result:

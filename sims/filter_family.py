@@ -502,7 +502,7 @@ def _pointing_error(attitude: Array, truth: Array) -> Array:
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     """Draw error and ANEES over time, one column per case, and write the figure."""
     cases = list(dict.fromkeys(o.case for o in outcomes))
-    figure, grid = plots.new_figure(2, len(cases), size=(4.0 * len(cases), 6.6), squeeze=False, sharex=True)
+    figure, grid = plots.new_figure(2, len(cases), size=(2.8 * len(cases), 6.2), squeeze=False, sharex=True)
     titles = {
         "small": "initial error 1° per axis",
         "large": "initial error 60° to 150°",
@@ -537,9 +537,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
         bottom.set_title(f"{scale} scale", loc="right", fontsize="small")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
     grid[1, 0].set_ylabel("ANEES / 6")
-    figure.legend(
-        *grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize="small", frameon=False
-    )
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return plots.save(figure, path)
 
 

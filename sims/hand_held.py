@@ -378,7 +378,7 @@ def draw(result: Result, path: Path) -> Path:
     """Draw the errors of every recording by filter, and their means, and write the figure."""
     treatment = list(result.scores)[-1]
     scores = result.scores[treatment]
-    figure, axes = plots.new_figure(1, 2, size=(13.0, 5.6), sharey=True)
+    figure, axes = plots.new_figure(1, 2, size=(10.5, 5.2), sharey=True)
     places = np.arange(len(result.recordings) + 1)
     for axis, part in zip(axes, (2, 0), strict=True):
         for k, (name, each) in enumerate(scores.items()):
@@ -389,7 +389,7 @@ def draw(result: Result, path: Path) -> Path:
                 places + shift,
                 np.append(values, values.mean()),
                 marker,
-                markersize=5.0,
+                markersize=4.0,
                 color=COLOURS[name],
                 label=name,
             )
@@ -405,7 +405,7 @@ def draw(result: Result, path: Path) -> Path:
 
 def draw_worst(results: Sequence[AhrsEstimate], path: Path) -> Path:
     """Draw heading and inclination errors over time with ±2σ for the given recordings, and write the figure."""
-    figure, axes = plots.new_figure(2, len(results), size=(6.5 * len(results), 6.0))
+    figure, axes = plots.new_figure(2, len(results), size=(5.2 * len(results), 6.0))
     for column, result in zip(np.reshape(axes, (2, len(results))).T, results, strict=True):
         used, estimate = result.recording, result.estimate
         assert used.true_attitude is not None
