@@ -102,6 +102,7 @@ nb_render_markdown_format = "myst"
 nb_output_stderr = "remove"  # progress bars; an error still stops the build
 myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline", "colon_fence"]
 myst_heading_anchors = 3
+smartquotes_action = "qe"  # quotes and ellipses: two hyphens begin an option
 
 
 class _OneTemplate(SandboxedEnvironment):
