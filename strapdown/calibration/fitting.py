@@ -24,7 +24,7 @@ import scipy.sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from strapdown.calibration.intervals import Errors, Intervals, Prediction, predicted
+from strapdown.calibration.intervals import Errors, Intervals, Mean, Prediction, predicted
 from strapdown.checks import Array
 from strapdown.kinematics import right_jacobian, skew
 from strapdown.units import DEGREE
@@ -177,6 +177,7 @@ class Problem:
         self.intervals, self.prior, self.gravity = intervals, prior, gravity
         self.size = 15 if intervals.field is not None else 12
         nodes = len(intervals.time)
+        self.here, self.there = self.size * intervals.node, self.size * (intervals.node + 1)
         self.errors_at = self.size * nodes
         self._last: tuple[Unknowns, Prediction] | None = None
         self.activity = np.full(nodes, 1.0)
@@ -209,77 +210,83 @@ class Problem:
 
     def equations(self, x: Unknowns) -> _Equations:
         """Return the equations linearised at some unknowns."""
-        iv, size, noise = self.intervals, self.size, self.noise
-        errors, p = unpacked(x.errors), self._predicted(x)
-        node, length, unit = iv.node, iv.length, np.eye(3)
-        here, there = size * node, size * (node + 1)
-        rotation, glob = x.attitude[node], self.errors_at
-        equations = _Equations(self.errors_at + len(x.errors))
-
-        relative = np.swapaxes(rotation @ p.turn, 1, 2) @ x.attitude[node + 1]
-        e = Rotation.from_matrix(relative).as_rotvec()
-        inverse = np.linalg.inv(right_jacobian(e))
-        back = -inverse @ np.swapaxes(relative, 1, 2)
-        equations.add(
-            "rotation", e, noise["rotation"] * np.sqrt(length),
-            (here + ATTITUDE, back @ np.swapaxes(p.turn, 1, 2)), (there + ATTITUDE, inverse),
-            (here + GYRO_BIAS, 0.5 * back @ p.turn_by[:, :, :3]), (there + GYRO_BIAS, 0.5 * back @ p.turn_by[:, :, :3]),
-            (glob, back @ p.turn_by[:, :, 3:]),
-        )  # fmt: skip
+        noise, node, length = self.noise, self.intervals.node, self.intervals.length
+        equations, p = _Equations(self.errors_at + len(x.errors)), self._predicted(x)
+        self._add_rotation(equations, x, p)
         self._process(equations, x, "bias", GYRO_BIAS, np.inf, BIAS_SIGMA, noise["bias"] * np.sqrt(length))
         self._process(equations, x, "lever", LEVER, np.inf, LEVER_SIGMA, LEVER_WALK * np.sqrt(length))
         velocity = noise["velocity"] * self.activity
-        self._process(
-            equations, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, np.sqrt(velocity[node] * velocity[node + 1])
-        )
+        middle = np.sqrt(velocity[node] * velocity[node + 1])
+        self._process(equations, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, middle)
+        self._add_force(equations, x, p.force)
+        if p.field is not None and self.intervals.field is not None:
+            sigma = noise["disturbance"]
+            self._process(equations, x, "disturbance", DISTURBANCE, DISTURBANCE_TIME, sigma, sigma)
+            self._add_field(equations, x, p.field, self.intervals.field.number)
+        equations.add(
+            "prior", (x.errors - self.prior.mean)[:, None], self.prior.sigma,
+            (self.errors_at + np.arange(len(x.errors)), np.ones((1, 1))),
+        )  # fmt: skip
+        return equations
 
-        rate = (iv.node_rate - x.bias) @ np.linalg.inv(unit + errors.gyro_matrix).T
+    def _add_rotation(self, equations: _Equations, x: Unknowns, p: Prediction) -> None:
+        """Add the equations of the rotation from node to node."""
+        node, here, there = self.intervals.node, self.here, self.there
+        relative = np.swapaxes(x.attitude[node] @ p.turn, 1, 2) @ x.attitude[node + 1]
+        e = Rotation.from_matrix(relative).as_rotvec()
+        inverse = np.linalg.inv(right_jacobian(e))
+        back = -inverse @ np.swapaxes(relative, 1, 2)
+        by_bias = 0.5 * back @ p.turn_by[:, :, :3]
+        equations.add(
+            "rotation", e, self.noise["rotation"] * np.sqrt(self.intervals.length),
+            (here + ATTITUDE, back @ np.swapaxes(p.turn, 1, 2)), (there + ATTITUDE, inverse),
+            (here + GYRO_BIAS, by_bias), (there + GYRO_BIAS, by_bias),
+            (self.errors_at, back @ p.turn_by[:, :, 3:]),
+        )  # fmt: skip
+
+    def _add_force(self, equations: _Equations, x: Unknowns, mean: Mean) -> None:
+        """Add the equations of the mean specific force."""
+        node, length, here, there = self.intervals.node, self.intervals.length, self.here, self.there
+        rotation, unit, L = x.attitude[node], np.eye(3), length[:, None, None]
+        rate = (self.intervals.node_rate - x.bias) @ np.linalg.inv(unit + unpacked(x.errors).gyro_matrix).T
         u, r = x.nodes[:, VELOCITY - 3 : VELOCITY], x.nodes[:, LEVER - 3 : LEVER]
         across = np.cross(rate, r)
         v = u + np.einsum("kij,kj->ki", x.attitude, across)
         by_turn, by_lever = -x.attitude @ skew(across), x.attitude @ skew(rate)
-        number, L = iv.force.number, length[:, None, None]
-        sigma = noise["force"] / np.sqrt(length)
-        sigma[number == 0.0] = np.inf
-        force = np.einsum("kij,kj->ki", rotation, p.force.value) - self.gravity * unit[2]
-        own = rotation @ p.force.by_own
+        sigma = self.noise["force"] / np.sqrt(length)
+        sigma[self.intervals.force.number == 0.0] = np.inf
+        force = np.einsum("kij,kj->ki", rotation, mean.value) - self.gravity * unit[2]
+        own = rotation @ mean.by_own
         own = np.concatenate([own[:, :, :3], own[:, :, 3:12] @ SYMMETRIC, own[:, :, 12:]], axis=2)
         equations.add(
             "force", force - (v[node + 1] - v[node]) / length[:, None], sigma,
-            (here + ATTITUDE, -rotation @ skew(p.force.value) + by_turn[node] / L), (there + ATTITUDE, -by_turn[node + 1] / L),
+            (here + ATTITUDE, -rotation @ skew(mean.value) + by_turn[node] / L), (there + ATTITUDE, -by_turn[node + 1] / L),
             (here + VELOCITY, unit / L), (there + VELOCITY, -unit / L),
             (here + LEVER, by_lever[node] / L), (there + LEVER, -by_lever[node + 1] / L),
-            *self._by_errors(rotation @ p.force.by_turn, own, here, there, BIAS.start),
+            *self._by_errors(rotation @ mean.by_turn, own, BIAS.start),
         )  # fmt: skip
-        if p.field is not None and iv.field is not None:
-            self._process(
-                equations, x, "disturbance", DISTURBANCE, DISTURBANCE_TIME, noise["disturbance"], noise["disturbance"]
-            )
-            dip, number = x.errors[DIP.start], iv.field.number
-            sigma = noise["field"] / np.sqrt(np.where(number > 0.0, number, np.finfo(float).tiny))
-            d = x.nodes[:, DISTURBANCE - 3 : DISTURBANCE]
-            error = np.einsum("kij,kj->ki", rotation, p.field.value) - [0.0, np.cos(dip), -np.sin(dip)]
-            equations.add(
-                "field", error - 0.5 * (d[node] + d[node + 1]), sigma,
-                (here + ATTITUDE, -rotation @ skew(p.field.value)),
-                (here + DISTURBANCE, -0.5 * unit), (there + DISTURBANCE, -0.5 * unit),
-                (glob + DIP.start, np.array([[0.0], [np.sin(dip)], [np.cos(dip)]])),
-                *self._by_errors(rotation @ p.field.by_turn, rotation @ p.field.by_own, here, there, IRON.start),
-            )  # fmt: skip
-        equations.add(
-            "prior", (x.errors - self.prior.mean)[:, None], self.prior.sigma,
-            (glob + np.arange(len(x.errors)), np.ones((1, 1))),
-        )  # fmt: skip
-        return equations
 
-    def _by_errors(
-        self, by_turn: Array, by_own: Array, here: np.ndarray, there: np.ndarray, place: int
-    ) -> Sequence[tuple[np.ndarray | int, np.ndarray]]:
+    def _add_field(self, equations: _Equations, x: Unknowns, mean: Mean, number: Array) -> None:
+        """Add the equations of the mean field; ``number`` (k,): its samples in each interval."""
+        node, here, there = self.intervals.node, self.here, self.there
+        rotation, dip, unit = x.attitude[node], x.errors[DIP.start], np.eye(3)
+        sigma = self.noise["field"] / np.sqrt(np.where(number > 0.0, number, np.finfo(float).tiny))
+        d = x.nodes[:, DISTURBANCE - 3 : DISTURBANCE]
+        error = np.einsum("kij,kj->ki", rotation, mean.value) - [0.0, np.cos(dip), -np.sin(dip)]
+        equations.add(
+            "field", error - 0.5 * (d[node] + d[node + 1]), sigma,
+            (here + ATTITUDE, -rotation @ skew(mean.value)),
+            (here + DISTURBANCE, -0.5 * unit), (there + DISTURBANCE, -0.5 * unit),
+            (self.errors_at + DIP.start, np.array([[0.0], [np.sin(dip)], [np.cos(dip)]])),
+            *self._by_errors(rotation @ mean.by_turn, rotation @ mean.by_own, IRON.start),
+        )  # fmt: skip
+
+    def _by_errors(self, by_turn: Array, by_own: Array, place: int) -> Sequence[tuple[np.ndarray | int, np.ndarray]]:
         """Return the derivatives of a mean (k, 3) by gyro bias and matrix, and by the errors of its own sensor from ``place`` on."""
         half = 0.5 * by_turn[:, :, :3]
         return (
-            (here + GYRO_BIAS, half),
-            (there + GYRO_BIAS, half),
+            (self.here + GYRO_BIAS, half),
+            (self.there + GYRO_BIAS, half),
             (self.errors_at, by_turn[:, :, 3:]),
             (self.errors_at + place, by_own),
         )
@@ -301,7 +308,7 @@ class Problem:
         begin = self.intervals.first
         equations.add(
             kind, values[node + 1] - decay[:, None] * values[node], sigma * drive,
-            (self.size * (node + 1) + place, np.eye(3)), (self.size * node + place, -decay[:, None, None] * np.eye(3)),
+            (self.there + place, np.eye(3)), (self.here + place, -decay[:, None, None] * np.eye(3)),
         )  # fmt: skip
         kind = kind if kind != "bias" else "start"  # the factor of the random walk's noise is not that of its start
         equations.add(
