@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -225,51 +225,19 @@ _FACTORS = {"deg": DEGREE, "deg2": DEGREE**2, "deg_per_h": DEGREE_PER_HOUR, "deg
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
     table = delimited.Table(path)
-    named: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
-    frames: set[str] = set()
-    for place, cell in enumerate(table.header):
-        for name, pattern in COLUMNS.items():
-            match = re.fullmatch(pattern, cell.strip().lower())
-            if match is None:
-                continue
-            parts = match.groupdict()
-            key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
-            if parts.get("frame"):
-                frames.add(parts["frame"])
-            if key in named[name]:
-                raise InputError(
-                    f"{path.name}: column {cell} has the same meaning as column {table.header[named[name][key][0]]}"
-                )
-            named[name][key] = (place, parts.get("unit") or "")
-    if len(frames) > 1:
-        raise InputError(
-            f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
-        )
-    if set(named["q"]) != set("wxyz") or not named["time"]:
-        raise InputError(
-            f"{path.name} lacks {'time' if not named['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
-            f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
-        )
-    time_place, time_unit = named["time"][""]
-    places = sorted({place for group in named.values() for place, _ in group.values()})
-    numbers = table.load(places, time_place)
+    places, frame = _places(path.name, table.header)
+    time_place, time_unit = places["time"][""]
+    numbers = table.load(sorted({place for group in places.values() for place, _ in group.values()}), time_place)
     stamps = table.clock_ns(time_place, "")  # dates, or numbers so large that no other unit makes sense
+    if stamps is None:
+        stamps = _counted_ns(path.name, numbers[time_place], TIME_UNITS[time_unit.replace("sec", "s") or "s"])
     columns = {
         name: {key: numbers[place] * _FACTORS.get(unit, 1.0) for key, (place, unit) in group.items()}
-        for name, group in named.items()
+        for name, group in places.items()
     }
-    if stamps is None:
-        tick = round(1e9 * TIME_UNITS[time_unit.replace("sec", "s") or "s"])
-        counts = array(f"{path.name}: time", np.rint(numbers[time_place] * tick), ("m",))
-        if np.any(np.abs(counts) >= 2.0**63):
-            raise InputError(
-                f"{path.name}: a time is {numbers[time_place][np.argmax(np.abs(counts))]:g}, which no clock counts"
-            )
-        stamps = counts.astype(np.int64)
     q = np.stack([columns["q"][axis] for axis in "wxyz"], axis=1)
     known = np.isfinite(q).all(axis=1)
-    covariance, frame, remarks = _covariance(path.name, columns, len(stamps))
-    frame = frame or next(iter(frames), "")
+    covariance, angles, remarks = _covariance(path.name, columns, len(stamps))
     bias = None
     if set(columns["bias"]) == set("xyz"):
         bias = np.stack([columns["bias"][axis] for axis in "xyz"], axis=1)
@@ -288,10 +256,46 @@ def _table(path: Path) -> Attitudes:
         stamps_ns=stamps[known],
         attitude=_unit(path.name, q[known]),
         covariance=None if covariance is None else covariance[known],
-        error_frame=frame,
+        error_frame=angles or frame,
         bias=None if bias is None else bias[known],
         remarks=tuple(remarks),
     )
+
+
+def _places(file: str, header: Sequence[str]) -> tuple[dict[str, dict[str, tuple[int, str]]], str]:
+    """Return place and unit of the columns by content (:data:`COLUMNS`) and axis, and the axes that the covariance's names state."""
+    places: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
+    frames: set[str] = set()
+    for place, cell in enumerate(header):
+        for name, pattern in COLUMNS.items():
+            match = re.fullmatch(pattern, cell.strip().lower())
+            if match is None:
+                continue
+            parts = match.groupdict()
+            key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
+            if parts.get("frame"):
+                frames.add(parts["frame"])
+            if key in places[name]:
+                raise InputError(f"{file}: column {cell} has the same meaning as column {header[places[name][key][0]]}")
+            places[name][key] = (place, parts.get("unit") or "")
+    if len(frames) > 1:
+        raise InputError(
+            f"{file}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
+        )
+    if set(places["q"]) != set("wxyz") or not places["time"]:
+        raise InputError(
+            f"{file} lacks {'time' if not places['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
+            f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(header[:12])}"
+        )
+    return places, next(iter(frames), "")
+
+
+def _counted_ns(file: str, time: Array, unit: float) -> NDArray[np.int64]:
+    """Return times (m,) as stamps, ns; ``unit``: that of the times, s."""
+    counts = array(f"{file}: time", np.rint(time * round(1e9 * unit)), ("m",))
+    if np.any(np.abs(counts) >= 2.0**63):
+        raise InputError(f"{file}: a time is {time[np.argmax(np.abs(counts))]:g}, which no clock counts")
+    return counts.astype(np.int64)
 
 
 def _covariance(name: str, columns: Mapping[str, Mapping[str, Array]], m: int) -> tuple[Array | None, str, list[str]]:

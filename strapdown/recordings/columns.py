@@ -146,15 +146,8 @@ def recording(
     roles, declared, remark = _roles(source, header, columns)
     if gyro_alone:
         roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
-    for group, members in GROUPS.items():
-        missing = [role for role in members if role not in roles]
-        if missing and (group in ("time", "gyro") or len(missing) < len(members)):
-            raise InputError(
-                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in header)}); "
-                f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
-            )
-    present = {_group(role) for role in roles}
-    unit_of_group = _units(source, present, declared, units)
+    _need_whole_groups(source, header, roles)
+    unit_of_group = _units(source, {_group(role) for role in roles}, declared, units)
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__
     _need_digits(source, values, roles)
     stamps = clock_ns(roles["time"], declared.get("time", ""))
@@ -164,21 +157,37 @@ def recording(
         time, epoch = relative_time(stamps)
     if "time" not in declared and not units.get("time"):
         _need_time_unit(source, header[roles["time"]].name, time)
-    fields: dict[str, Any] = {}
-    for group in FIELDS.keys() & present:
-        factor = UNITS[group][unit_of_group[group]] if group in ("gyro", "accelerometer") else 1.0
-        samples = np.stack([values(roles[role]) for role in GROUPS[group]], axis=1) * factor
-        fields[FIELDS[group]] = samples if samples.shape[1] > 1 else samples[:, 0]
-    if "movement" in fields:
-        fields["movement"] = fields["movement"] > 0.5
     return with_gyro(
         source=source,
         time=time,
         epoch_ns=epoch,
         magnetic_unit=unit_of_group.get("magnetometer", ""),
         remarks=(remark,) if remark else (),
-        **fields,
+        **_fields(roles, values, unit_of_group),
     )
+
+
+def _need_whole_groups(source: str, header: Sequence[Column], roles: Mapping[str, int]) -> None:
+    """Raise an error if columns of time or gyro, or some of another group, are missing."""
+    for group, members in GROUPS.items():
+        missing = [role for role in members if role not in roles]
+        if missing and (group in ("time", "gyro") or len(missing) < len(members)):
+            raise InputError(
+                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in header)}); "
+                f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
+            )
+
+
+def _fields(roles: Mapping[str, int], values: Callable[[int], Array], units: Mapping[str, str]) -> dict[str, Any]:
+    """Return the samples in the fields of a recording, those of gyro and accelerometer in SI."""
+    fields: dict[str, Any] = {}
+    for group in FIELDS.keys() & {_group(role) for role in roles}:
+        factor = UNITS[group][units[group]] if group in ("gyro", "accelerometer") else 1.0
+        samples = np.stack([values(roles[role]) for role in GROUPS[group]], axis=1) * factor
+        fields[FIELDS[group]] = samples if samples.shape[1] > 1 else samples[:, 0]
+    if "movement" in fields:
+        fields["movement"] = fields["movement"] > 0.5
+    return fields
 
 
 def _group(role: str) -> str:
