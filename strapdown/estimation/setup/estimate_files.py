@@ -64,16 +64,7 @@ def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
             group = file.create_group(f"innovations/{number:06d}")
             # The sensor is not the group's name, because a slash in it would create a subgroup.
             set_attributes(group, {"sensor": sensor})
-            put(group, "time", innovations.time, "s")
-            put(
-                group,
-                "innovation",
-                innovations.innovation,
-                "rad, or the sensor's unit over the length of its reference",
-            )
-            put(group, "variance", innovations.variance, "the square of the innovation's")
-            if innovations.weight is not None:
-                put(group, "weight", innovations.weight, "1", "0: rejected; 1: full weight")
+            _put_innovations(group, innovations)
         for number, (sensor, skipped) in enumerate(estimate.skipped.items()):
             set_attributes(file.create_group(f"skipped/{number:06d}"), {"sensor": sensor, "number": skipped})
         for number, event in enumerate(estimate.events):
@@ -83,6 +74,14 @@ def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
             set_attributes(group, {"name": name, "components": block.components, "units": block.units})
             put(group, "values", block.values, "those of the attribute units")
             put(group, "variance", block.variance, "the square of the values'")
+
+
+def _put_innovations(group: Any, innovations: Innovations) -> None:
+    put(group, "time", innovations.time, "s")
+    put(group, "innovation", innovations.innovation, "rad, or the sensor's unit over the length of its reference")
+    put(group, "variance", innovations.variance, "the square of the innovation's")
+    if innovations.weight is not None:
+        put(group, "weight", innovations.weight, "1", "0: rejected; 1: full weight")
 
 
 def _put_truth(file: Any, truth: Truth) -> None:
@@ -112,21 +111,11 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         time = increasing(reading.place(file, "time"), _numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
-        size = 6 if "bias" in file else 3  # an estimate of another program may have none
-        variance = np.full((rows, 6), np.nan)  # an integrated attitude has no covariance
-        covariance: Array | None = np.broadcast_to(np.nan, (rows, 6, 6))
-        if "variance" in file or "covariance" in file:
-            covariance = None
-            variance = _above_zero(reading.place(file, "variance"), _numbers(file, "variance", (rows, size)))
-            variance = _padded(variance, ((0, 0), (0, 6 - size)))
-        if "covariance" in file:
-            covariance = _numbers(file, "covariance", (rows, size, size))
-            _above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
-            covariance = _padded(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)))
+        variance, covariance = _variances(file, rows)
         return Estimate(
             time=time,
             attitude=attitude,
-            bias=_biases(file, "bias", rows) if size == 6 else np.full((rows, 3), np.nan),
+            bias=_biases(file, "bias", rows) if "bias" in file else np.full((rows, 3), np.nan),
             variance=variance,
             covariance=covariance,
             whole_covariance=_numbers(file, "whole_covariance", (rows, "n", "n"))
@@ -156,8 +145,19 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         )
 
 
-def _padded(values: Array, widths: Any) -> Array:
-    return np.pad(values, widths, constant_values=np.nan)
+def _variances(file: Any, rows: int) -> tuple[Array, Array | None]:
+    """Return variance (rows, 6) and covariance (rows, 6, 6) of attitude and bias, NaN where there is none, without a covariance None."""
+    size = 6 if "bias" in file else 3  # an estimate of another program may have none
+    without = (0, 6 - size)
+    if not ("variance" in file or "covariance" in file):  # of an integrated attitude
+        return np.full((rows, 6), np.nan), np.broadcast_to(np.nan, (rows, 6, 6))
+    variance = _above_zero(reading.place(file, "variance"), _numbers(file, "variance", (rows, size)))
+    variance = np.pad(variance, ((0, 0), without), constant_values=np.nan)
+    if "covariance" not in file:
+        return variance, None
+    covariance = _numbers(file, "covariance", (rows, size, size))
+    _above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
+    return variance, np.pad(covariance, ((0, 0), without, without), constant_values=np.nan)
 
 
 def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
