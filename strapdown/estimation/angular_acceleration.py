@@ -48,53 +48,58 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
         )
     rates = record.rates
     white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
+    order, window, noise, bend = _best_window(rates, white, mean)
+    acceleration, sharp = (
+        np.asarray(savgol_filter(rates, w, order, deriv=1, delta=mean, axis=0)) for w in (window, _half(order, window))
+    )
+    h, sharper = (_slopes(order, w)[_REACH, : WINDOWS[-1]] / mean for w in (window, _half(order, window)))
+    acceleration = acceleration * _lost(acceleration, sharp, white * float(h @ h), white * float(h @ sharper))
+    smooth = np.asarray(savgol_filter(rates, ORDERS[0] + 2, ORDERS[0], axis=0))
+    # A sample is the mean over its interval, f + f″ dt²/24.
+    for series in (smooth, acceleration):
+        series[1:-1] -= np.diff(series, 2, axis=0) / 24.0
+    near, nodes = _cubic((time - 0.5 * (record.time[0] + record.time[1])) / mean, len(dt))
+    turns_over = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
+    lags = np.array([h[lag:] @ h[: len(h) - lag] for lag in range(4)]) / (h @ h)
+    alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
+    left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
+    return np.concatenate(turns_over, axis=1), noise * left[:, None] + bend
 
-    def weights(order: int, window: int) -> Array:
-        return np.asarray(_slopes(order, window)[_REACH, : WINDOWS[-1]]) / mean
 
-    def slope(order: int, window: int) -> Array:
-        return np.asarray(savgol_filter(rates, window, order, deriv=1, delta=mean, axis=0))
+def _best_window(rates: Array, white: Array, dt: float) -> tuple[int, int, Array, Array]:
+    """Return order and window of the slope with the smallest sum of variances (3,), that of noise and that of bias, and both.
 
+    ``white`` (3,) is the variance of the gyro's noise in a sample.
+    """
     bending = np.diff(rates[:MAX_SAMPLES], 2, axis=0).T
     products = [_products(axis) for axis in bending]
     tried = [(order, window) for order in ORDERS for window in WINDOWS if window >= order + 2]
     noises, bends = [], []
     for order, window in tried:
-        apart = (_slopes(order, window) - _slopes(order, _half(order, window))) / mean
+        apart = (_slopes(order, window) - _slopes(order, _half(order, window))) / dt
         bent = _mean_squares(apart, bending, products)
         bent -= white * float(apart[_REACH] @ apart[_REACH])
-        noises.append(white * float(np.sum(weights(order, window) ** 2)))
+        noises.append(white * float(np.sum((_slopes(order, window)[_REACH, : WINDOWS[-1]] / dt) ** 2)))
         bends.append(np.maximum(bent, 0.0))
     best = int(np.argmin(np.sum(np.array(noises) + BIAS_WEIGHT * np.array(bends), axis=1)))
-    order, window = tried[best]
-    acceleration = slope(order, window)
-    h, sharper = weights(order, window), weights(order, _half(order, window))
-    sharp = slope(order, _half(order, window))
-    lost = _lost(acceleration, sharp, white * float(h @ h), white * float(h @ sharper))
-    acceleration = acceleration * lost
-    smooth = np.asarray(savgol_filter(rates, ORDERS[0] + 2, ORDERS[0], axis=0))
-    # A sample is the mean over its interval, f + f″ dt²/24.
-    for series in (smooth, acceleration):
-        series[1:-1] -= np.diff(series, 2, axis=0) / 24.0
-    # Cubic interpolation from the four nearest midpoints: linear interpolation would reduce the peaks of oscillations of about ten samples.
-    place = np.clip((time - 0.5 * (record.time[0] + record.time[1])) / mean, 0.0, len(dt) - 1.0)
-    k = np.clip(np.floor(place).astype(np.int64), 1, len(dt) - 3)
+    return *tried[best], noises[best], bends[best]
+
+
+def _cubic(place: Array, number: int) -> tuple[np.ndarray, Array]:
+    """Return the four of a number of points nearest to each place (m, 4), and their weights in cubic interpolation.
+
+    Linear interpolation would reduce the peaks of oscillations of about ten samples.
+    """
+    place = np.clip(place, 0.0, number - 1.0)
+    k = np.clip(np.floor(place).astype(np.int64), 1, number - 3)
     s = place - k
-    nodes = np.stack(
-        [
-            -s * (s - 1.0) * (s - 2.0) / 6.0,
-            (s + 1.0) * (s - 1.0) * (s - 2.0) / 2.0,
-            -(s + 1.0) * s * (s - 2.0) / 2.0,
-            (s + 1.0) * s * (s - 1.0) / 6.0,
-        ],
-        axis=1,
+    weights = (
+        -s * (s - 1.0) * (s - 2.0) / 6.0,
+        (s + 1.0) * (s - 1.0) * (s - 2.0) / 2.0,
+        -(s + 1.0) * s * (s - 2.0) / 2.0,
+        (s + 1.0) * s * (s - 1.0) / 6.0,
     )
-    near = k[:, None] + np.arange(-1, 3)
-    turns_over = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
-    lags = np.array([h[lag:] @ h[: len(h) - lag] for lag in range(4)]) / (h @ h)
-    alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
-    left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
-    return np.concatenate(turns_over, axis=1), noises[best] * left[:, None] + bends[best]
+    return k[:, None] + np.arange(-1, 3), np.stack(weights, axis=1)
 
 
 def _products(series: Array) -> Array:

@@ -244,35 +244,8 @@ def _keys(plan: Plan) -> np.ndarray:
 def _gyro_terms(plan: Plan, record: ImuRecord, limit: float, turns: Array) -> montecarlo_run.Gyro:
     """Return the gyro for the kernel; ``turns``: true increments at the gyro's rate."""
     scenario, spec, samples = plan.scenario, plan.scenario.gyro, plan.setup.integration.samples
-    dt, steps = samples / scenario.rate, len(record.increments)
-    white, walk, markov, instability, resolution = (
-        np.broadcast_to(value, 3)
-        for value in (
-            spec.angle_random_walk,
-            spec.rate_random_walk,
-            spec.markov_noise,
-            spec.bias_instability,
-            spec.rate_resolution,
-        )
-    )
-    tau = spec.markov_correlation_time
-    decay, variance, mean, remainder = gyro_errors.markov_step(dt, tau)
-    sizes = np.array(
-        [
-            np.sqrt(white**2 * dt + walk**2 * dt**3 / 12.0 + markov**2 * remainder),
-            walk * np.sqrt(dt),
-            np.full(3, decay),
-            markov * np.sqrt(variance),
-            np.full(3, mean),
-            markov * np.sqrt(0.5 * tau) if np.isfinite(tau) else np.zeros(3),
-            np.broadcast_to(spec.turn_on_bias_sigma, 3),
-            instability,
-            np.full(3, spec.range),
-            resolution,
-        ]
-    )
-    shaping = flicker.shaping(steps)
-    flickers = bool(np.any(instability > 0.0))
+    shaping = flicker.shaping(len(record.increments))
+    flickers = bool(np.any(np.greater(spec.bias_instability, 0.0)))
     scale = np.sqrt(np.diag(shaping.covariance))
     factor = scale[:, None] * np.linalg.cholesky(shaping.covariance / np.outer(scale, scale))
     force = np.empty((0, 3))
@@ -288,19 +261,39 @@ def _gyro_terms(plan: Plan, record: ImuRecord, limit: float, turns: Array) -> mo
         true_bias=record.truth.bias,
         terms=np.array(
             [
-                np.any(walk > 0.0),
-                np.any(markov > 0.0),
+                np.any(np.greater(spec.rate_random_walk, 0.0)),
+                np.any(np.greater(spec.markov_noise, 0.0)),
                 flickers,
                 _units_differ(plan),
                 np.isfinite(spec.range),
-                np.any(resolution > 0.0),
+                np.any(np.greater(spec.rate_resolution, 0.0)),
             ]
         ),
-        sizes=sizes,
+        sizes=_gyro_sizes(spec, samples / scenario.rate),
         poles=shaping.poles,
         gains=shaping.gains,
         poles_start=factor if flickers else np.empty((0, flicker.STATES)),
     )
+
+
+def _gyro_sizes(spec: GyroSpec, dt: float) -> Array:
+    """Return the magnitudes of the gyro's errors over a step of dt, s, per axis, as the kernel reads them (10, 3)."""
+    white, walk, markov = spec.angle_random_walk, spec.rate_random_walk, spec.markov_noise
+    tau = spec.markov_correlation_time
+    decay, variance, mean, remainder = gyro_errors.markov_step(dt, tau)
+    sizes = (
+        np.sqrt(np.square(white) * dt + np.square(walk) * dt**3 / 12.0 + np.square(markov) * remainder),
+        np.multiply(walk, np.sqrt(dt)),
+        decay,
+        np.multiply(markov, np.sqrt(variance)),
+        mean,
+        np.multiply(markov, np.sqrt(0.5 * tau)) if np.isfinite(tau) else 0.0,
+        spec.turn_on_bias_sigma,
+        spec.bias_instability,
+        spec.range,
+        spec.rate_resolution,
+    )
+    return np.array([np.broadcast_to(size, 3) for size in sizes])
 
 
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
