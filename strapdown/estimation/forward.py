@@ -617,23 +617,10 @@ def segment_width(model: Model) -> int:
 def _run(problem: Problem, options: Options) -> Passed:
     """Run the filter of any number of error states, with or without a gate."""
     record, events, model, every = problem.record, problem.events, problem.model, options.every
-    kernels, rows = instance_of(model), len(record.increments) // every + 1
-    n = kernels.N
+    kernels = instance_of(model)
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
     body = filter_body(problem, units)
-    whole_rows = rows if options.whole_bias else 0
-    kept = n if options.error_state_covariance else 6
-    shapes = (
-        (rows, n + 1),
-        (rows, n),
-        (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
-        (whole_rows, 6),
-        (whole_rows if options.full_covariance else 0, 6, 6),
-        _innovations(events, judged=options.judged),
-        (options.segments + 1 if options.segments else 0, segment_width(model)),
-    )
-    *written, stored = (np.empty(shape) for shape in shapes)
-    out = structure.Outputs._make((*written, stored[: options.segments]))
+    out, predictions = _outputs(problem, options)
     judge = Judge(problem, options)
     weight, number = None, 0
     happened = gaps(record)
@@ -652,9 +639,10 @@ def _run(problem: Problem, options: Options) -> Passed:
         if number < 0:
             raise TooPreciseError()
     if options.segments:
-        stored[number, :4] = 0.0
-        stored[number, 4 : 5 + n] = body.x[0]
-        stored[number, 5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]
+        end, n = predictions[number], kernels.N
+        end[:4] = 0.0
+        end[4 : 5 + n] = body.x[0]
+        end[5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]
     happened += last_lock_outs(judge.counters, events.sensors)
     innovations = innovations_by_sensor(events, out.innovation, weight)
     covariance = out.covariance if len(out.covariance) else None
@@ -675,8 +663,26 @@ def _run(problem: Problem, options: Options) -> Passed:
     return Passed(
         estimate=estimate,
         make_end=lambda: state_of(body, memory, units),
-        segments=stored[: number + 1],
+        segments=predictions[: number + 1],
     )
+
+
+def _outputs(problem: Problem, options: Options) -> tuple[structure.Outputs, Array]:
+    """Return the arrays that the filter fills, and that of its predictions with a further row, for the end."""
+    n, rows = problem.model.structure.n, len(problem.record.increments) // options.every + 1
+    whole_rows = rows if options.whole_bias else 0
+    kept = n if options.error_state_covariance else 6
+    shapes = (
+        (rows, n + 1),
+        (rows, n),
+        (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
+        (whole_rows, 6),
+        (whole_rows if options.full_covariance else 0, 6, 6),
+        _innovations(problem.events, judged=options.judged),
+        (options.segments + 1 if options.segments else 0, segment_width(problem.model)),
+    )
+    *arrays, predictions = (np.empty(shape) for shape in shapes)
+    return structure.Outputs._make((*arrays, predictions[: options.segments])), predictions
 
 
 class TooPreciseError(InputError):

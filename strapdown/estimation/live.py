@@ -162,27 +162,13 @@ class LiveFilter:
         judge.counters, judge.memory, self._counts, *own = views
         self._innovation, self._weight = np.zeros((most, 6)), np.ones(most)
         self._events = np.zeros((2 * most + sensors, 5))
-        length, size = np.ones(most), 6 + model.states
-        body: Any
-        out: Any
+        length = np.ones(most)
+        self._x: Array
         if self._whole:
-            self._x: Array = own[0][0]
-            body = filter_._replace(x=own[0], P=own[1], length=length)
-            out = structure.Outputs(
-                x=np.empty((1, size + 1)),
-                variance=np.empty((1, size)),
-                covariance=np.empty((0, size, size)),
-                whole_variance=np.empty((0, 6)),
-                whole_covariance=np.empty((0, 6, 6)),
-                innovation=self._innovation,
-                segments=np.empty((0, 0)),
-            )
+            self._x, self._body = own[0][0], filter_._replace(x=own[0], P=own[1], length=length)
         else:
-            self._x = own[0][:7]
-            body = filter_._replace(state=own[0])
-            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 21))]
-            out = six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
-        self._body = body
+            self._x, self._body = own[0][:7], filter_._replace(state=own[0])
+        body, out = self._body, self._outputs(6 + model.states)
         if options.judged:
             out = gate.Outputs(form=out, weight=self._weight, events=self._events)
             body = judge.body(body)
@@ -196,6 +182,21 @@ class LiveFilter:
         self._kind = dispatcher.typeof_pyval(self._arrays)
         types = dispatcher.typeof_pyval(self._kind), *map(dispatcher.typeof_pyval, (self._table, 0, 0))
         self._step = dispatcher.compile(types)
+
+    def _outputs(self, n: int) -> Any:
+        """Return the outputs of the kernels for n states, of which the innovations alone are used."""
+        if not self._whole:
+            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 21))]
+            return six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
+        return structure.Outputs(
+            x=np.empty((1, n + 1)),
+            variance=np.empty((1, n)),
+            covariance=np.empty((0, n, n)),
+            whole_variance=np.empty((0, 6)),
+            whole_covariance=np.empty((0, 6, 6)),
+            innovation=self._innovation,
+            segments=np.empty((0, 0)),
+        )
 
     def _live(self, dispatcher: Any, body: Any, out: Any, length: Array, results: int) -> kernel.Live:
         """Return the kernel's arrays."""

@@ -151,24 +151,16 @@ def _assembled(
 ) -> Model:
     """Return the model that :func:`assemble` describes: short records need one model again and again."""
     kinds = dict(sensors_and_kinds)
-    decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
-    for name, values in (("decay", decay), ("density", density)):
-        if np.any(values < 0.0):
-            raise InputError(f"{name} of error state {int(np.argmax(values < 0.0))} is negative; give zero or more")
+    decay, density = _not_negative(blocks, "decay"), _not_negative(blocks, "density")
     offsets = _stack(blocks, "gyro_offset", (3,))
     if generic and (slopes := temperature.slopes(blocks)) is not None:
         offsets[slopes] = np.eye(3)
     scales, forces = _stack(blocks, "gyro_scale", (3, 3)), _stack(blocks, "gyro_force", (3, 3))
     force_f = _force(blocks, np.any(scales != 0.0, axis=(1, 2)) & np.any(forces != 0.0, axis=(1, 2)))
     feed = _feeds(blocks)
-    linked = (feed != 0.0) | np.append(False, feed != 0.0)[: len(feed)]
     entering = np.any(offsets != 0.0, axis=1)
     of_the_gyro = entering | np.any(scales != 0.0, axis=(1, 2)) | np.any(forces != 0.0, axis=(1, 2))
-    if np.any(linked & of_the_gyro):
-        raise InputError(
-            f"error state {int(np.argmax(linked & of_the_gyro))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
-            "effect on the gyro"
-        )
+    _need_apart(feed, of_the_gyro)
     numbers = _Numbers(generic=generic)
     groups = np.concatenate([np.full(block.size, generic * i) for i, block in enumerate(blocks)] or [np.empty(0)])
     chains, last, sets = _chains(decay, density, feed, groups)
@@ -201,6 +193,24 @@ def _assembled(
         levers=np.array([any(state.lever for state in sensor.states) for sensor in sensors], bool),
         varying=varying,
     )
+
+
+def _not_negative(blocks: Sequence[ErrorStates], name: str) -> Array:
+    """Return decay or density of each state, checked."""
+    values = _stack(blocks, name, ())
+    if np.any(values < 0.0):
+        raise InputError(f"{name} of error state {int(np.argmax(values < 0.0))} is negative; give zero or more")
+    return values
+
+
+def _need_apart(feed: Array, of_the_gyro: np.ndarray) -> None:
+    """Raise an error if a state of a chain enters the gyro."""
+    linked = (feed != 0.0) | np.append(False, feed != 0.0)[: len(feed)]
+    if np.any(linked & of_the_gyro):
+        raise InputError(
+            f"error state {int(np.argmax(linked & of_the_gyro))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
+            "effect on the gyro"
+        )
 
 
 def _chains(

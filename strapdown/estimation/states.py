@@ -308,21 +308,8 @@ def _attitude_of_set(
         else:
             sigmas.append(float(np.hypot(vectors.sigma[0] / scale, np.sqrt(grown - common))))
     if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
-        # Together with the vertical, a heading is a direction: the horizontal part of its vector.
-        direction, reference, sigma, turned = headings[0]
-        level = direction - body[0] * (direction @ body[0])
-        horizontal = reference - fixed[0] * (reference @ fixed[0])
-        attitude = wahba.solve(
-            np.array([*body, level]), np.array([*fixed, horizontal]), np.array([*sigmas, sigma])
-        ).attitude
-        # A tilt changes the heading too, by the tangent of the dip, but the heading has no information about the tilt.
-        R = quaternion.to_matrix(attitude)
-        row = np.array(heading_row(tuple(R.ravel()), tuple(direction)))
-        if not row.any():
-            raise InputError("the vector that should give the heading is vertical")
-        tilt = np.eye(3) - np.outer(R[2], R[2])
-        variance = sigma**2 + turned * (row @ row)
-        return attitude, np.linalg.inv(tilt / sigmas[0] ** 2 + np.outer(row, row) / variance) + common * np.eye(3)
+        attitude, P = _from_vertical(body[0], fixed[0], sigmas[0], *headings[0])
+        return attitude, P + common * np.eye(3)
     if len(body) < 2:
         raise InputError(
             f"two directions are needed, or the vertical and a heading; the record has {len(body)} of directions "
@@ -330,6 +317,27 @@ def _attitude_of_set(
         )
     solution = wahba.solve(np.array(body), np.array(fixed), np.array(sigmas))
     return solution.attitude, solution.covariance + common * np.eye(3)
+
+
+def _from_vertical(
+    up_b: Array, up_f: Array, up_sigma: float, direction: Array, reference: Array, sigma: float, turned: float
+) -> tuple[Array, Array]:
+    """Return attitude and covariance from the vertical and a heading, whose ``direction`` is measured in body axes.
+
+    ``turned``: variance of the rotation about each axis between their times, rad².
+    """
+    # Together with the vertical, a heading is a direction: the horizontal part of its vector.
+    level = direction - up_b * (direction @ up_b)
+    horizontal = reference - up_f * (reference @ up_f)
+    attitude = wahba.solve(np.array([up_b, level]), np.array([up_f, horizontal]), np.array([up_sigma, sigma])).attitude
+    # A tilt changes the heading too, by the tangent of the dip, but the heading has no information about the tilt.
+    R = quaternion.to_matrix(attitude)
+    row = np.array(heading_row(tuple(R.ravel()), tuple(direction)))
+    if not row.any():
+        raise InputError("the vector that should give the heading is vertical")
+    tilt = np.eye(3) - np.outer(R[2], R[2])
+    variance = sigma**2 + turned * (row @ row)
+    return attitude, np.linalg.inv(tilt / up_sigma**2 + np.outer(row, row) / variance)
 
 
 def _turn_until(record: ImuRecord, bias: Array, time: float) -> Array:

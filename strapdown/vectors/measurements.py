@@ -146,17 +146,38 @@ class VectorMeasurements:
 
     def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
         """Return sigma (m,), and sigma_axes (m, 3) and covariance (m, 3, 3) if they are given."""
-        columns: dict[str, Array] = {}
-        axes: Array | None = None
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
             raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
+        known: Any = ~missing if missing.any() else slice(None)
+        columns, axes = self._noise_of_axes(m, missing, known)
+        sigma = self._sigma(m, missing)
+        has_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
+        if axes is None and self.kind == "attitude":
+            if not has_sigma:
+                raise InputError(
+                    f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
+                )
+            columns["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
+        if axes is not None:
+            mean = np.sqrt(np.mean(axes**2, axis=1))
+            same = np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0)
+            if self.kind != "attitude" and has_sigma and not same:
+                raise InputError(
+                    f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
+                )
+            sigma = mean
+        return columns | {"sigma": sigma}
+
+    def _noise_of_axes(self, m: int, missing: np.ndarray, known: Any) -> tuple[dict[str, Array], Array | None]:
+        """Return sigma_axes (m, 3) and covariance (m, 3, 3) as far as they are given, and σ of the axes (m, 3) by either."""
+        columns: dict[str, Array] = {}
+        axes: Array | None = None
         if self.sigma_axes is not None:
             own = self._repeated("sigma_axes", (m, 3), "one number per body axis (3,), or (m, 3)")
             axes = _of_known(f"{self.sensor}: sigma_axes", own, missing, _root_mean_square)
             if np.any(axes < 0.0):
                 raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
             columns["sigma_axes"] = axes
-        known: Any = ~missing if missing.any() else slice(None)
         if self.covariance is not None:
             columns["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m, missing)
             diagonal = np.sqrt(np.einsum("kii->ki", whole))
@@ -165,13 +186,12 @@ class VectorMeasurements:
             axes = diagonal
             if self.kind == "attitude":
                 columns["sigma_axes"] = axes
+        return columns, axes
+
+    def _sigma(self, m: int, missing: np.ndarray) -> Array:
+        """Return sigma (m,), checked."""
         by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
         own = self._repeated("sigma", (m,), f"one number, or one per sample{by_axis}")
-        given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
-        if axes is None and self.kind == "attitude" and not given_sigma:
-            raise InputError(
-                f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
-            )
         sigma = _of_known(f"{self.sensor}: sigma", own, missing, _root_mean_square)
         if np.any(sigma < 0.0):
             k = int(np.argmax(sigma < 0.0))
@@ -180,21 +200,7 @@ class VectorMeasurements:
         if vanishing.any():
             k = int(np.argmax(vanishing))
             raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}, and its square underflows; check its unit")
-        if axes is not None:
-            mean = np.sqrt(np.mean(axes**2, axis=1))
-            if (
-                self.kind != "attitude"
-                and given_sigma
-                and not np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0)
-            ):
-                raise InputError(
-                    f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
-                )
-            sigma = mean
-        elif self.kind == "attitude":
-            columns["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
-        columns["sigma"] = sigma
-        return columns
+        return sigma
 
     def _repeated(self, field: str, shape: tuple[int, ...], remedy: str) -> Array:
         """Return the numbers of a field for each sample, of this shape; those for one sample are repeated."""
