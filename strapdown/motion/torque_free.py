@@ -146,11 +146,8 @@ class _Solution(NamedTuple):
     """(I_3 − I_1) L/(I_1 I_3), rad/s"""
 
 
-def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
-    """Return the solution from principal moments and w_b at time 0, in exact fractions up to the final roots."""
-    from scipy.special import elliprf
-
-    moments, w = [Fraction(i) for i in inertia], [Fraction(r) for r in rate]
+def _axes(moments: Sequence[Fraction], w: Sequence[Fraction]) -> Array:
+    """Return the axes 1 to 3 of the solution as rows (3, 3): axis 2 is that of the middle moment, and w is not negative about 1 and 3."""
     small, middle, large = sorted(range(3), key=lambda axis: moments[axis])
     # The sign of L² − 2T I_2 decides which axis is axis 3; on the separatrix either will do.
     excess = sum((moments[i] * (moments[i] - moments[middle]) * w[i] ** 2 for i in range(3)), Fraction(0))
@@ -162,6 +159,16 @@ def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
     axes[2, third] = -1.0 if w[third] < 0 else 1.0
     axes[1, middle] = 1.0
     axes[1] *= np.linalg.det(axes)
+    return axes
+
+
+def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
+    """Return the solution from principal moments and w_b at time 0, in exact fractions up to the final roots."""
+    from scipy.special import elliprf
+
+    moments, w = [Fraction(i) for i in inertia], [Fraction(r) for r in rate]
+    axes = _axes(moments, w)
+    first, middle, third = (int(np.argmax(np.abs(axis))) for axis in axes)
     i1, i2, i3 = moments[first], moments[middle], moments[third]
     w1, w2, w3 = abs(w[first]), int(axes[1, middle]) * w[middle], abs(w[third])
     wide = i1 * (i3 - i1) * w1**2 + i2 * (i3 - i2) * w2**2  # 2T I_3 − L²

@@ -82,14 +82,20 @@ def read_ulog(file: Path, *, topic: str) -> Recording:
     own["magnetic_unit"] = "G" if "magnetic_field" in own else ""
     reference = next((name for name in (TRUTH, ATTITUDE) if name in data and len(data[name]["timestamp"]) > 1), None)
     if reference is not None:
-        at, kept, words = in_order(reference, data[reference]["timestamp"])
-        ned = quaternion.normalize(columns(data[reference], "q", 4)[kept])
-        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
-        whose = "that of the simulator" if reference == TRUTH else "the vehicle's estimate"
-        remarks += [f"Reference: {reference}, {whose}.", *words]
+        own["true_attitude"], words = _reference(reference, data[reference], time, epoch)
+        remarks += words
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )
+
+
+def _reference(topic: str, rows: dict[str, Any], time: Array, epoch: int) -> tuple[Array, list[str]]:
+    """Return the attitude of a topic (m, 4), q_fb, at times, s, and remarks on it."""
+    stamps, kept, words = in_order(topic, rows["timestamp"])
+    ned = quaternion.normalize(columns(rows, "q", 4)[kept])
+    whose = "that of the simulator" if topic == TRUTH else "the vehicle's estimate"
+    attitude = interpolated(time, (stamps * 1000 - epoch) / 1e9, outputs.to_ned(ned))
+    return attitude, [f"Reference: {topic}, {whose}.", *words]
 
 
 SECONDS, SECONDS_PER_MB = 2.0, 2.0
