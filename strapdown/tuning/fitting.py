@@ -97,17 +97,16 @@ def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) ->
 def search(
     objective: Objective,
     start: Array,
-    priors: Mapping[str, Prior] | None = None,
+    priors: Mapping[str, Prior],
     *,
     fixed: Sequence[int] = (),
     steps: int = 200,
 ) -> Optimum:
     """Return the minimum reached from ``start``; the parameters with indices ``fixed`` are held fixed."""
-    known = dict(priors or {})
     x = np.array(start, float)
     moving = np.array([j not in fixed for j in range(len(x))], bool)
     low, high = objective.limits
-    here = local_at(objective, x, known)
+    here = local_at(objective, x, priors)
     damping, stretch = 1e-3, 1.0
 
     def ended(number: int, *, converged: bool = True) -> Optimum:
@@ -130,7 +129,7 @@ def search(
             gain = -float(here.score[active] @ delta[active])
             if gain < 1e-7 and np.abs(delta).max() < 0.05:
                 return ended(number)
-            there = local_at(objective, trial, known)
+            there = local_at(objective, trial, priors)
             if there.value <= here.value:
                 break
             damping, stretch = max(10.0 * damping, 1e-3), 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,11 @@ from strapdown.checks import InputError
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
-from strapdown.records import ImuRecord
-from strapdown.tuning.diagnosis.causes import Diagnosis
+from strapdown.records import Estimate, ImuRecord
+from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
 from strapdown.tuning.diagnosis.commutation import commutation
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
-from strapdown.tuning.diagnosis.likelihood import Model, by_mean, by_variance, run
+from strapdown.tuning.diagnosis.likelihood import Model, Run, by_mean, by_variance, run
 
 GROSS = 3.0
 """Conventions are tested if the NIS per degree of freedom of a sensor exceeds this, because a wrong one has a large effect."""
@@ -68,14 +69,7 @@ def diagnose(
     if judgement is None:
         judgement = consistency.judge(estimate, kept, confidence_level=probability)
     base = run(model)
-    considered = [by_variance(model, base, hypothesis) for hypothesis in noise_hypotheses(model)]
-    considered += [by_mean(model, base, hypothesis) for hypothesis in mean_hypotheses(model)]
-    considered += [
-        outliers(sensor, innovations.whitened)
-        for sensor, innovations in estimate.innovations.items()
-        if len(innovations.time)
-    ]
-    considered.append(commutation(record, setup, estimate, kept))
+    considered = [*_causes(model, base, estimate), commutation(record, setup, estimate, kept)]
     worst = max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in estimate.innovations.values() if len(i.time))
     if worst > GROSS:
         considered += conventions(model, base)
@@ -96,3 +90,14 @@ def diagnose(
         judgement=together,
         probability=probability,
     )
+
+
+def _causes(model: Model, base: Run, estimate: Estimate) -> Iterator[Cause]:
+    """Yield the causes that change the filter's model, and outliers, likely or not; ``base``: the innovations of that model."""
+    for hypothesis in noise_hypotheses(model):
+        yield by_variance(model, base, hypothesis)
+    for hypothesis in mean_hypotheses(model):
+        yield by_mean(model, base, hypothesis)
+    for sensor, innovations in estimate.innovations.items():
+        if len(innovations.time):
+            yield outliers(sensor, innovations.whitened)
