@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import coning, quaternion, recordings
 from strapdown.ahrs.remarks import gap_words
-from strapdown.checks import InputError, instance
+from strapdown.checks import Array, InputError, instance
 from strapdown.recordings import Recording
 from strapdown.records import Estimate, ImuRecord, Origin
 from strapdown.workflows.estimating import SOURCE
@@ -64,11 +64,8 @@ def integrate(
     remarks = [f"{len(increments)} samples over {steps[-1] - steps[0]:.6g} s with {rule.name}."]
     if left := len(increments) % rule.samples:
         remarks.append(f"Samples not used at the end, an incomplete step of {rule.samples}: {left}.")
-    true = np.empty((0, 4)) if known is None else known[:: rule.samples][: len(attitude)]
-    rows = np.isfinite(true).all(axis=1)
-    if rows.any():
-        error = np.degrees(quaternion.angle_between(quaternion.normalize(true[rows]), attitude[: len(true)][rows]))
-        remarks.append(f"Error relative to the true attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
+    if known is not None:
+        remarks.append(_error_words(known[:: rule.samples][: len(attitude)], attitude))
     if isinstance(source, Recording):
         gaps = gap_words(recordings.gaps(source.time))
         remarks += [f"{gaps}: the rotation during a gap is interpolated."] if gaps else []
@@ -83,3 +80,12 @@ def integrate(
         remarks=tuple(filter(None, remarks)),
         details={"algorithm": rule.name},
     )
+
+
+def _error_words(true: Array, attitude: Array) -> str:
+    """Return a sentence on the errors of attitudes where the true ones (m, 4), of the first m of them, are known; empty if none is."""
+    rows = np.isfinite(true).all(axis=1)
+    if not rows.any():
+        return ""
+    error = np.degrees(quaternion.angle_between(quaternion.normalize(true[rows]), attitude[: len(true)][rows]))
+    return f"Error relative to the true attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°."
