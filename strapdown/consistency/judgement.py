@@ -450,22 +450,27 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
         value = float(nees(e[-1], P[-1], states)) / len(states)
         words = error_words(f"the {subset} error at the end", value)
         findings.append(ratio("NEES at the end", subset, value, len(states), 1, words))
-        why = ""
-        if len(e) < FEWEST_TO_AVERAGE:
-            why = "too few epochs with a truth"
-        elif not (estimate.motion or _averages(subset, tuple(estimate.error_states))):
-            why = "the correlation time of errors with further error states is not known from one run"
-        else:
-            average = time_average(e, P, states)
-            words = error_words(f"the {subset} error over the run", average.mean)
-            if average.reliable:
-                size = (average.mean, len(states), average.effective)
-                findings.append(ratio("time-averaged NEES", subset, *size, words, average.certainty))
-            else:
-                why = f"its error changes too slowly for this run, {average.effective:.2g} effective samples"
-        if subset in untested:
-            untested[subset] = why
+        average = _over_run(estimate, subset, e, P)
+        if isinstance(average, Finding):
+            findings.append(average)
+        elif subset in untested:
+            untested[subset] = average
     return findings
+
+
+def _over_run(estimate: Estimate, subset: str, e: Array, P: Array) -> Finding | str:
+    """Return the finding on the errors of a subset of the states over the run, or the reason why they are not tested."""
+    if len(e) < FEWEST_TO_AVERAGE:
+        return "too few epochs with a truth"
+    if not (estimate.motion or _averages(subset, tuple(estimate.error_states))):
+        return "the correlation time of errors with further error states is not known from one run"
+    states = SUBSETS[subset]
+    average = time_average(e, P, states)
+    if not average.reliable:
+        return f"its error changes too slowly for this run, {average.effective:.2g} effective samples"
+    size = (average.mean, len(states), average.effective)
+    words = error_words(f"the {subset} error over the run", average.mean)
+    return ratio("time-averaged NEES", subset, *size, words, average.certainty)
 
 
 def _largest_at_end(error: Array, variance: Array) -> Finding:
@@ -523,24 +528,7 @@ def concluded(
         marked.append(replace(finding, rejected=is_rejected, low=low, high=high))
     errors = detectable_errors(marked, confidence_level)
     tested = tuple(Part(of=of, detectable_error=errors.get(of, math.inf), why=why) for of, why in parts.items())
-    rejected = [finding for finding in marked if finding.rejected]
-    verdict: Answer
-    if rejected:
-        verdict = "not consistent"
-        leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
-        which = "the one test contradicts it"
-        if len(marked) > 1:
-            which = f"{len(rejected)} of {len(marked)} tests contradict{'s' if len(rejected) == 1 else ''} it"
-        reason = f"{leaning}; {which}"
-    elif not marked:
-        nothing = (
-            "no covariance: nothing to test"
-            if NO_COVARIANCE in parts.values()
-            else "no innovation, and no truth: nothing to test"
-        )
-        verdict, reason = "cannot tell", nothing
-    else:
-        verdict, reason = _of_parts(tested, required, runs, agree)
+    verdict, reason = _verdict(marked, tested, required, runs, agree)
     if unmodelled:
         reason += f"; the filter has no state for {', '.join(unmodelled)}"
     return Judgement(
@@ -569,6 +557,23 @@ def detectable_errors(findings: Sequence[Finding], confidence_level: float) -> d
         of = f"{INNOVATIONS}{finding.of}" if finding.name == "NIS" else finding.of
         best[of] = min(best.get(of, math.inf), math.sqrt(high / low) if low > 0.0 else math.inf)
     return best
+
+
+def _verdict(
+    findings: Sequence[Finding], parts: Sequence[Part], required: float, runs: str, agree: str
+) -> tuple[Answer, str]:
+    """Return verdict and reason."""
+    rejected = [finding for finding in findings if finding.rejected]
+    if rejected:
+        leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
+        which = "the one test contradicts it"
+        if len(findings) > 1:
+            which = f"{len(rejected)} of {len(findings)} tests contradict{'s' if len(rejected) == 1 else ''} it"
+        return "not consistent", f"{leaning}; {which}"
+    if not findings:
+        without = any(part.why == NO_COVARIANCE for part in parts)
+        return "cannot tell", f"{NO_COVARIANCE if without else 'no innovation, and no truth'}: nothing to test"
+    return _of_parts(parts, required, runs, agree)
 
 
 def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> tuple[Answer, str]:
