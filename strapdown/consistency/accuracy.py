@@ -47,10 +47,7 @@ class ReferenceErrors:
             raise InputError(
                 "no sample to judge has a valid reference attitude; check the movement mask and the reference"
             )
-        return {
-            name: float(np.sqrt(np.mean(getattr(self, name)[judged] ** 2)))
-            for name in ("total", "heading", "inclination")
-        }
+        return {kind: float(np.sqrt(np.mean(getattr(self, kind)[judged] ** 2))) for kind in KINDS}
 
 
 def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErrors:
@@ -221,7 +218,7 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     truth = estimate.truth if truth is None else truth
     if truth is None:
         raise InputError("the estimate has no truth; give one")
-    known = np.isfinite(truth.attitude).all(axis=1)
+    known = truth.known
     if not known.any():
         raise InputError("the truth has no attitude at the estimate's times")
     P = estimate.attitude_covariance

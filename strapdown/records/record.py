@@ -45,6 +45,11 @@ class Truth(ByValue):
     movement: np.ndarray | None = None
 
     @property
+    def known(self) -> np.ndarray:
+        """Whether each attitude is known (n + 1,)."""
+        return np.asarray(np.isfinite(self.attitude).all(axis=1))
+
+    @property
     def has_bias(self) -> bool:
         """Whether the gyro bias is known."""
         return bool(np.isfinite(self.bias).any())

@@ -271,11 +271,10 @@ def _nis_course(innovations: Iterable[Innovations]) -> Course:
 
 
 def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[Course, ...]:
-    known = None if truth is None else np.isfinite(truth.attitude).all(axis=1)
-    if truth is None or known is None or int(known.sum()) < MIN_ERRORS:
+    if truth is None or int(truth.known.sum()) < MIN_ERRORS:
         return ()
     assert estimate.covariance is not None
-    size = 6 if truth.has_bias else 3
+    known, size = truth.known, 6 if truth.has_bias else 3
     error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known])
     time, error, P = estimate.time[known], error[:, :size], estimate.covariance[known, :size, :size]
     middles, place = _spans(time, time[0], time[-1])

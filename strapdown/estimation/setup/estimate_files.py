@@ -86,7 +86,7 @@ def _put_innovations(group: Any, innovations: Innovations) -> None:
 
 def _put_truth(file: Any, truth: Truth) -> None:
     """Write the rows of a truth at which it is known."""
-    known = np.isfinite(truth.attitude).all(axis=1)
+    known = truth.known
     if not known.all():
         put(file, "truth/row", np.flatnonzero(known).astype(np.float64), "1", "rows of the estimate with a truth")
     put(file, "truth/attitude", truth.attitude[known], "1")
