@@ -26,11 +26,12 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     truth = estimate.truth
     error = None
     if truth is not None:
-        known = np.isfinite(truth.attitude).all(axis=1)
+        known = truth.known
         error = np.full((len(estimate.time), 6), np.nan)
         error[known] = consistency.errors(
             estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
         )
+    charts = _estimate_charts(estimate) if error is None else _error_charts(estimate, error)
     judgement = workflows.check(estimate)
     table = None if truth is None else workflows.accuracy(estimate)
     source = "" if estimate.origin is None else estimate.origin.source
@@ -41,7 +42,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.listed(estimate.listing()),
         *([] if table is None else [page.listed(table.listing())]),
         *([page.section("Evidence", page.table(judgement.listing()))] if judgement.findings else []),
-        _over_time(estimate, truth, error),
+        page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude)),
         *[_sensor(name, innovations) for name, innovations in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
@@ -64,42 +65,46 @@ def _parts(estimate: Estimate) -> tuple[tuple[slice, Callable[[Array], tuple[str
     return parts if estimate.has_bias else parts[:1]
 
 
-def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> str:
-    sigma = estimate.sigma
+def _error_charts(estimate: Estimate, error: Array) -> list[str]:
+    """Return a chart of each error, NaN where it is unknown, with the filter's ±3σ if there is a covariance."""
     charts = []
-    settled = slice(len(estimate.time) // 20, None)
-    if truth is not None and error is not None:
-        for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
-            if not np.isfinite(error[:, states]).any():
-                continue
-            known = bool(np.isfinite(sigma[:, states]).any())  # an estimate of another program may have no covariance
-            unit, size = unit_of(3.0 * sigma[settled, states] if known else error[settled, states])
-            for k, axis in enumerate(AXES):
-                state = states.start + k
-                bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
-                series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) if known else []
-                series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=page.COLOURS[k]))
-                reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
-                label = f"{what.lower()} {axis}, {unit}"
-                charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
-    else:
-        euler = roll_pitch_yaw(estimate.attitude)
+    sigma, settled = estimate.sigma, slice(len(estimate.time) // 20, None)
+    for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
+        if not np.isfinite(error[:, states]).any():
+            continue
+        known = bool(np.isfinite(sigma[:, states]).any())  # an estimate of another program may have no covariance
+        unit, size = unit_of(3.0 * sigma[settled, states] if known else error[settled, states])
+        for k, axis in enumerate(AXES):
+            state = states.start + k
+            bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
+            series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) if known else []
+            series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=page.COLOURS[k]))
+            reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
+            label = f"{what.lower()} {axis}, {unit}"
+            charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
+    return charts
+
+
+def _estimate_charts(estimate: Estimate) -> list[str]:
+    """Return charts of the Euler angles, the bias, and the σ of the attitude, as far as the estimate has them."""
+    time, sigma = estimate.time, estimate.sigma
+    euler = roll_pitch_yaw(estimate.attitude)
+    series = [
+        page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
+        for k, name in enumerate(angle_labels(estimate.fixed_frame))
+    ]
+    charts = [page.chart("Attitude, Euler angles Z-Y-X", "angle, °", time, series)]
+    if estimate.has_bias:
+        unit, size = rate_unit(3.0 * sigma[len(time) // 20 :, 3:])
         series = [
-            page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
-            for k, name in enumerate(angle_labels(estimate.fixed_frame))
+            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
         ]
-        charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
-        if estimate.has_bias:
-            unit, size = rate_unit(3.0 * sigma[settled, 3:])
-            series = [
-                page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
-            ]
-            charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
-        if estimate.has_covariance:
-            spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
-            series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
-            charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
-    return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
+        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", time, series))
+    if estimate.has_covariance:
+        spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
+        series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
+        charts.append(page.chart("Attitude σ", "attitude σ, °", time, series))
+    return charts
 
 
 def _sensor(name: str, innovations: Innovations) -> str:
@@ -123,7 +128,7 @@ def _sensor(name: str, innovations: Innovations) -> str:
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     if truth is None:
         return []
-    known = np.isfinite(truth.attitude).all(axis=1)
+    known = truth.known
     angle = quaternion.angle_between(estimate.attitude[known], truth.attitude[known])
 
     def draw() -> Figure:
