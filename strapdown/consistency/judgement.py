@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -30,7 +30,9 @@ from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Column, Listed, Table, figure
 
-Answer = Literal["consistent", "not consistent", "cannot tell"]
+Answer = Literal["consistent", "cannot tell", "not consistent"]
+VERDICTS: tuple[Answer, ...] = get_args(Answer)
+"""The last of several decides on all of them together."""
 
 MIN_SAMPLES = 50
 """Minimum number of innovations of a sensor for the tests of whiteness, normality and mean."""
@@ -326,33 +328,32 @@ def judge(
     if estimate.error_states:
         names = tuple(estimate.error_states)
         limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: no truth for it")
-    rules = {"required": detectable_error, "unmodelled": unmodelled_errors(estimate.origin, estimate.setup)}
-    if not estimate.motion:
-        return concluded(findings, limits, confidence_level, parts=untested, **rules)  # type: ignore[arg-type]
-    return _bounded(estimate, truth, findings, limits, confidence_level, untested, rules)
+    if estimate.motion:
+        findings = [
+            replace(finding, p_value=finding.p_value if finding.value > 1.0 else 1.0)
+            for finding in findings
+            if finding.is_ratio
+        ]
+    judged = concluded(
+        findings,
+        limits,
+        confidence_level,
+        parts=untested,
+        required=detectable_error,
+        unmodelled=unmodelled_errors(estimate.origin, estimate.setup),
+        agree="within σ" if estimate.motion else "consistent",
+    )
+    return _bounded(judged, estimate, truth) if estimate.motion else judged
 
 
-def _bounded(
-    estimate: Estimate,
-    truth: Truth | None,
-    findings: Sequence[Finding],
-    limits: Sequence[str],
-    confidence_level: float,
-    parts: Mapping[str, str],
-    rules: Mapping[str, Any],
-) -> Judgement:
-    """Return the verdict on a filter whose σ are upper bounds: one-sided tests of the ratios only."""
-    ratios = [
-        replace(finding, p_value=finding.p_value if finding.value > 1.0 else 1.0)
-        for finding in findings
-        if finding.is_ratio
-    ]
-    judged = concluded(ratios, limits, confidence_level, parts=parts, agree="within σ", **rules)
-    judged = replace(judged, findings=tuple(replace(finding, low=0.0) for finding in judged.findings))
-    if judged.verdict == "not consistent" or not ratios:
+def _bounded(judged: Judgement, estimate: Estimate, truth: Truth | None) -> Judgement:
+    """Return the verdict by one-sided tests of the ratios of a filter whose σ are upper bounds, with the ratios that it tests."""
+    findings = tuple(replace(finding, low=0.0) for finding in judged.findings)
+    judged = replace(judged, findings=findings)
+    if judged.verdict == "not consistent" or not findings:
         return judged
     sizes = [
-        f"innovations of {finding.of} {math.sqrt(finding.value):.2g}" for finding in ratios if finding.name == "NIS"
+        f"innovations of {finding.of} {math.sqrt(finding.value):.2g}" for finding in findings if finding.name == "NIS"
     ]
     if truth is not None:
         table = accuracy(estimate, truth)

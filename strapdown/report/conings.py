@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import InputError
+from strapdown.consistency.judgement import VERDICTS
 from strapdown.files import reading
 from strapdown.montecarlo import coning_study
 from strapdown.report import page
@@ -24,16 +25,12 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         ) from None
 
 
-WORST_FIRST = ("not consistent", "cannot tell", "consistent")
-"""Verdicts on one filter, in the order in which they decide on several."""
-
-
 def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     scenario, drifts, filters = study["scenario"], study["integration"], study["filter"]
     *own_tables, drift_table, filter_table = coning_study.tables(study)
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
-    answer = min((row["verdict"] for row in filters), key=WORST_FIRST.index)
+    answer = max((row["verdict"] for row in filters), key=VERDICTS.index)
     passing = [row["integration"] for row in filters if row["verdict"] == "consistent"]
     reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter"
     reason += f": {', '.join(passing)}" if passing else ""

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import InputError, one_of
+from strapdown.consistency.judgement import VERDICTS
 from strapdown.files import reading
 from strapdown.plots.tuning import TALLEST
 from strapdown.report import page
 from strapdown.results import Table
-from strapdown.tuning.fitting import VERDICTS
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:

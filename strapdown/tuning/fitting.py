@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from strapdown.checks import Array, Hint, InputError, count, known_keys
+from strapdown.consistency.judgement import VERDICTS
 from strapdown.estimation.setup import FilterSetup
 from strapdown.files import plain
 from strapdown.results import Column, Listed, Table, figure
@@ -331,9 +332,6 @@ class Tuning(Listed):
         """Return the parameter with this name."""
         known_keys("tuning", [name], [parameter.name for parameter in self.parameters])
         return next(parameter for parameter in self.parameters if parameter.name == name)
-
-
-VERDICTS = ("consistent", "cannot tell", "not consistent")
 
 
 def verdict(tuning: Tuning) -> tuple[str, str, list[str]]:
