@@ -264,8 +264,8 @@ def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
     return tables.build(Dispersions, table, _FORM, place)  # type: ignore[no-any-return]
 
 
-def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100) -> int:
-    """Return the largest number of epochs, at most ``most``, that divide the scenario into whole filter steps."""
+def whole_epochs(scenario: Scenario, filter_setup: FilterSetup) -> int:
+    """Return the largest number of epochs, at most 100, that divide the scenario into whole filter steps."""
     need_setup(filter_setup)
     samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
     if samples % step:
@@ -273,4 +273,4 @@ def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100)
             f"{samples} gyro samples are not a whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
             f"that gives a multiple of {step}"
         )
-    return max(n for n in range(1, most + 1) if (samples // step) % n == 0)
+    return max(n for n in range(1, 101) if (samples // step) % n == 0)

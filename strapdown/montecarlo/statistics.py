@@ -576,6 +576,6 @@ def worst(run: Counts, score: Array) -> tuple[Counts, Array]:
     return run[order], score[order]
 
 
-def judged_epochs(epochs: int, most: int = 20) -> Counts:
-    """Return the indices of at most ``most`` equally spaced epochs, without the start, where the error is drawn, not estimated."""
-    return np.unique(np.linspace(max(1, epochs // most), epochs, min(most, epochs)).astype(np.int64))
+def judged_epochs(epochs: int) -> Counts:
+    """Return the indices of at most 20 equally spaced epochs, without the start, where the error is drawn, not estimated."""
+    return np.unique(np.linspace(max(1, epochs // 20), epochs, min(20, epochs)).astype(np.int64))

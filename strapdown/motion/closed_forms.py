@@ -39,7 +39,7 @@ class ConstantRate:
 
     def __post_init__(self) -> None:
         store_vector(self, "rate")
-        store_attitude(self, "initial_attitude")
+        store_attitude(self)
 
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""
@@ -301,7 +301,7 @@ class Slew:
         store_vector(self, "rotation_vector")
         object.__setattr__(self, "duration", checks.positive("duration", self.duration, unit="s"))
         store_number(self, "start", "s")
-        store_attitude(self, "initial_attitude")
+        store_attitude(self)
 
     @property
     def end(self) -> float:

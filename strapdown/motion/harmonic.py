@@ -82,7 +82,7 @@ class HarmonicRates:
                 )
         object.__setattr__(self, "harmonics", harmonics)
         store_vector(self, "mean")
-        store_attitude(self, "initial_attitude")
+        store_attitude(self)
 
     def _sum(self, parts: Callable[[Harmonic], Array], mean: Array, shape: tuple[int, ...]) -> Array:
         total = np.broadcast_to(mean, (*shape, 3)).copy()

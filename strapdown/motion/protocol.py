@@ -115,8 +115,9 @@ def store_vector(motion: object, name: str) -> tuple[float, ...]:
     return value
 
 
-def store_attitude(motion: object, name: str) -> None:
-    """Check a parameter of a frozen motion and store it as a unit quaternion."""
+def store_attitude(motion: object) -> None:
+    """Check the initial attitude of a frozen motion and store it as a unit quaternion."""
+    name = "initial_attitude"
     value = checks.unit_quaternions(name, checks.array(name, getattr(motion, name), (4,)))
     object.__setattr__(motion, name, tuple(value.tolist()))
 

@@ -59,7 +59,7 @@ class TorqueFree:
                     f"inertia[{i}] is {moment:g}, more than the sum of the other two; no rigid body has such principal moments"
                 )
         store_vector(self, "initial_rate")
-        store_attitude(self, "initial_attitude")
+        store_attitude(self)
 
     @functools.cached_property
     def _steady(self) -> ConstantRate | None:

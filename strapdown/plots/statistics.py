@@ -13,7 +13,7 @@ from matplotlib.patches import Ellipse
 from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
-from strapdown.montecarlo.statistics import COVERED, judged_epochs
+from strapdown.montecarlo.statistics import COVERED, SUBSETS, judged_epochs
 from strapdown.plots import style
 from strapdown.units import angle_unit, rate_unit
 
@@ -48,10 +48,9 @@ def nees_over_time(
         The axes.
     """
     ax = style.axes_or_new(ax)
-    column = ("state", "attitude", "bias").index(subset)
     ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label=label)
     for k, (name, statistics) in enumerate(named):
-        ax.plot(statistics.time, statistics.anees[:, column], label=name, **style.layered(k, len(named)))
+        ax.plot(statistics.time, statistics.anees[:, SUBSETS[subset][0]], label=name, **style.layered(k, len(named)))
     style.log_scale(ax)
     ax.set_xlabel("time, s")
     ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
@@ -109,7 +108,7 @@ def runs_overview(statistics: Statistics) -> Figure:
             (finding.low, finding.high) for finding in findings if (finding.name, finding.of) == ("ANEES", subset)
         )
         nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
-        anees = statistics.anees[judged, ("state", "attitude", "bias").index(subset)]
+        anees = statistics.anees[judged, SUBSETS[subset][0]]
         ax.plot(statistics.time[judged], anees, ".", color=style.CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
     if statistics.sensor_degrees.sum() > 0:
