@@ -79,7 +79,7 @@ def montecarlo(
         _replay(plan, replay, computing.machine, target)
         return None
     new = held is None or target != source or computing.resume or computing.overwrite
-    result = _computed(plan, target, source.stem, computing) if new else held
+    result = _computed(plan, target, source.stem, computing) if new or held is None else held
     ui.show(sd.check(result).listing(), title=ui.EVIDENCE)
     content = result.summary()
     ui.show(*verdicts.tables(content))
@@ -90,23 +90,22 @@ def montecarlo(
     return {"verdict": content["judgement"]["verdict"]}
 
 
-def _planned(source: Path, scenario: str, model: _Model) -> tuple[Any, Plan]:
+def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | None, Plan]:
     """Return the campaign of a file, None if the source is no campaign file, and the plan."""
     from strapdown import workflows
-    from strapdown.estimation.filters.own import read_filter
-    from strapdown.estimation.setup import read_setup
+    from strapdown.estimation.filters.own import Own, read_filter
+    from strapdown.estimation.setup import FilterSetup, read_setup
     from strapdown.montecarlo import campaign as campaigns
     from strapdown.workflows import filters
 
     place: Path | None = model.filter_file
-    setup: Any = None
-    own = place is not None and (place.suffix == ".py" or ".py:" in place.name)
-    if place is not None and own:
+    setup: FilterSetup | Own | None = None
+    if place is not None and (place.suffix == ".py" or ".py:" in place.name):
         ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
         setup = read_filter(place)
     if source.suffix.lower() in ui.HDF5:
         held = campaigns.read(source)
-        if own:
+        if isinstance(setup, Own):
             held, model = campaigns.with_filter(held, setup, source), replace(model, filter_file=None)
         for name in options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")

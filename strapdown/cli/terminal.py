@@ -207,7 +207,7 @@ def check_files(
         )
 
 
-def written(*paths: Any) -> None:
+def written(*paths: Path) -> None:
     """Print which files were written."""
     if paths:
         console.print("Written: " + ", ".join(map(str, paths)))

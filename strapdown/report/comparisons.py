@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,12 @@ def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str],
 
 
 def _differences(
-    what: str, time: Array, difference: Array, sigmas: tuple[Array, Array], names: tuple[str, str], unit_of: Any
+    what: str,
+    time: Array,
+    difference: Array,
+    sigmas: tuple[Array, Array],
+    names: tuple[str, str],
+    unit_of: Callable[[Array], tuple[str, float]],
 ) -> list[str]:
     """Return a chart of each axis of a difference, with ±3σ of the first estimate as a band and of the second as lines."""
     settled = slice(len(time) // 20, None)

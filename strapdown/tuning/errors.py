@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -102,7 +102,7 @@ class Reference(NamedTuple):
     bias: Array | None
     """Gyro bias (m, 3) if known, rad/s."""
 
-    def at(self, rows: Any) -> Reference:
+    def at(self, rows: slice) -> Reference:
         """Return the selected rows."""
         return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -54,14 +53,17 @@ INDEPENDENT = 1.0
 """Spacing of measurements of a recording for nearly independent disturbances, s."""
 
 
-def by_innovations(names: Sequence[str] | None, spacing: float = 0.0, **more: Any) -> tuple[Sequence[str], float]:
+def by_innovations(
+    names: Sequence[str] | None, spacing: float = 0.0, *, gate: bool = False, priors: object = None
+) -> tuple[Sequence[str], float]:
     """Return the parameters of a recording's filter that innovations can tune, only the scale of all σ, and the measurement spacing, s.
 
     On the eleven trials of BROAD this leaves the error unchanged, and the NEES per state is 0.01 to 0.91 (0.13 to 10 before). With all σ
-    free the error grows on nine of them, from 3.0° to 7.7° on average; scaled by all innovations, the NEES is up to 28. ``more`` holds
-    other options, which need a valid likelihood.
+    free the error grows on nine of them, from 3.0° to 7.7° on average; scaled by all innovations, the NEES is up to 28. ``gate`` and
+    ``priors`` need a valid likelihood, so they are refused.
     """
-    wanted = [name for name in names or [] if name != SCALE] + [name for name, is_wanted in more.items() if is_wanted]
+    wanted = [name for name in names or [] if name != SCALE]
+    wanted += [name for name, is_wanted in (("gate", gate), ("priors", priors)) if is_wanted]
     if wanted:
         raise InputError(
             f"{wanted[0]} cannot be tuned by the innovations of a recording: its disturbances last, so a filter of larger likelihood is "

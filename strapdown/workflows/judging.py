@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -65,15 +65,17 @@ def check(
     if isinstance(result, Estimate):
         options = {"confidence_level": confidence_level, "detectable_error": detectable_error}
         return consistency.judge(result, _truth_at(result, truth), **options)
-    statistics: Any = getattr(result, "statistics", result)
+    from strapdown.montecarlo import Statistics
+    from strapdown.montecarlo.campaign import Campaign
+
+    statistics = result.statistics if isinstance(result, Campaign) else result
     if statistics is None:
         raise InputError("the Monte Carlo has no finished run yet; resume it")
-    if not hasattr(statistics, "log_nees_sum"):
+    if not isinstance(statistics, Statistics):
         raise InputError(f"result is {type(result).__name__}; give an Estimate, or the result of monte_carlo")
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
-    judgement: Judgement = statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)
-    return judgement
+    return statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)
 
 
 def diagnose(
