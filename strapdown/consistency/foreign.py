@@ -2,9 +2,8 @@
 
 :func:`check_attitudes` aligns clocks and frames: gross differences are removed, reported, and their uncertainty added to the covariance.
 The definition of the attitude covariance is given or found from the errors, and :func:`strapdown.consistency.judge` judges the result.
-Small
-differences that would explain the errors are reported with the verdict and not removed unless requested, because a constant rotation
-between frames and a constant error of the filter are indistinguishable.
+Small differences that would explain the errors are reported with the verdict and not removed unless requested, because a constant
+rotation between frames and a constant error of the filter are indistinguishable.
 """
 
 from __future__ import annotations
