@@ -645,25 +645,31 @@ def _run(problem: Problem, options: Options) -> Passed:
         end[5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]
     happened += last_lock_outs(judge.counters, events.sensors)
     innovations = innovations_by_sensor(events, out.innovation, weight)
-    covariance = out.covariance if len(out.covariance) else None
     estimate = replace(
-        estimate_of(problem, every, out.x, out.variance, covariance),
+        _estimate(problem, options, out),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
         events=in_order(happened),
     )
-    if options.whole_bias:
-        estimate = replace(
-            estimate,
-            bias=out.x[:, 4:7] + out.x[:, 7:] @ model.offsets,
-            variance=out.whole_variance,
-            covariance=out.whole_covariance if options.full_covariance else None,
-        )
     memory = judge.remembered(body)
     return Passed(
         estimate=estimate,
         make_end=lambda: state_of(body, memory, units),
         segments=predictions[: number + 1],
+    )
+
+
+def _estimate(problem: Problem, options: Options, out: structure.Outputs) -> Estimate:
+    """Return the estimate of the states, with the bias alone or the whole gyro error as its bias."""
+    covariance = out.covariance if len(out.covariance) else None
+    estimate = estimate_of(problem, options.every, out.x, out.variance, covariance)
+    if not options.whole_bias:
+        return estimate
+    return replace(
+        estimate,
+        bias=out.x[:, 4:7] + out.x[:, 7:] @ problem.model.offsets,
+        variance=out.whole_variance,
+        covariance=out.whole_covariance if options.full_covariance else None,
     )
 
 
