@@ -129,6 +129,17 @@ def _options(shared: _Shared, specified: _Specified, recorded: _Recorded) -> dic
     }
 
 
+def _parts(run: Run, result: sd.records.Estimate, *, observability: bool) -> dict[str, Any]:
+    """Return the observability, if asked for, and the errors, if there is a truth, by the names of their files."""
+    parts: dict[str, Any] = {}
+    if observability:
+        with ui.progress_bar("observability"):
+            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
+    if result.truth is not None:
+        parts["errors.json"] = sd.accuracy(result)
+    return parts
+
+
 def _save(out: Path, run: Run, result: sd.records.Estimate, contents: Mapping[str, Any], source: str) -> list[Path]:
     """Write the estimate, further numbers and a new calibration to a folder, and return the files."""
     for name in FILES[1:]:  # of an earlier estimate; this one may not write all of them
@@ -179,12 +190,7 @@ def estimate(
     result = run.estimate if field is None else field.to_true_north(run.estimate)
     ui.say(*result.remarks)
     ui.show(result.listing())
-    parts: dict[str, Any] = {}
-    if shared.observability:
-        with ui.progress_bar("observability"):
-            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
-    if result.truth is not None:
-        parts["errors.json"] = sd.accuracy(result)
+    parts = _parts(run, result, observability=shared.observability)
     ui.show(*(part.listing() for part in parts.values()))
     if field is not None:
         parts["field.json"] = field.compared(source, result)
