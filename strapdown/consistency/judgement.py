@@ -328,14 +328,8 @@ def judge(
     if estimate.error_states:
         names = tuple(estimate.error_states)
         limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: no truth for it")
-    if estimate.motion:
-        findings = [
-            replace(finding, p_value=finding.p_value if finding.value > 1.0 else 1.0)
-            for finding in findings
-            if finding.is_ratio
-        ]
     judged = concluded(
-        findings,
+        _one_sided(findings) if estimate.motion else findings,
         limits,
         confidence_level,
         parts=untested,
@@ -344,6 +338,12 @@ def judge(
         agree="within σ" if estimate.motion else "consistent",
     )
     return _bounded(judged, estimate, truth) if estimate.motion else judged
+
+
+def _one_sided(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the ratios, of which only those above 1 contradict a filter whose σ are upper bounds."""
+    ratios = [finding for finding in findings if finding.is_ratio]
+    return [replace(finding, p_value=finding.p_value if finding.value > 1.0 else 1.0) for finding in ratios]
 
 
 def _bounded(judged: Judgement, estimate: Estimate, truth: Truth | None) -> Judgement:
