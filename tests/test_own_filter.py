@@ -15,7 +15,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import filters, setup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import Plan, campaign, verdicts
-from strapdown.records import Estimate, Truth
+from strapdown.records import Estimate, Truth, cut
 from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -330,9 +330,13 @@ def test_bad_filters_are_refused():
         estimate = wrapped(record, initial)
         return replace(estimate, time=estimate.time + 0.01)
 
+    def half(record, initial):
+        return wrapped(cut(record, 0, len(record.increments) // 2), initial)
+
     for bad, message in (
         (lambda record, initial: 3, "return Estimate.from_arrays"),
         (shifted, "time\\[0\\] is 0.01 s, where the record has no edge"),
+        (half, "half ends at [0-9.]+ s, [0-9.]+ s before the record; return values up to its end"),
     ):
         with pytest.raises(InputError, match=message):
             montecarlo.run_plan(with_filter(bad), runs=1)
