@@ -468,7 +468,7 @@ def test_a_recording_is_by_default_that_of_a_hand(succeeds, recording, tmp_path)
     attributes = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
-    assert len(states["gyro scale"]["values"]) == 9
+    assert states["gyro scale"]["components"] == ["x", "xy=yx", "xz=zx", "y", "yz=zy", "z"]
     assert (attributes["motion"], attributes["smoothed"], attributes["latency"]) == (
         "hand",
         False,
