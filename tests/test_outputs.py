@@ -2,12 +2,14 @@
 
 import csv
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+import strapdown as sd
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
@@ -130,6 +132,16 @@ def case():
         covariance=P,
     )
     return estimate, recording
+
+
+def test_the_file_of_an_estimate_keeps_the_clock(case, tmp_path):
+    _, recording = case
+    n = 300
+    rest = {"rate": np.zeros((n, 3)), "specific_force": np.tile([0.0, 0.0, 9.81], (n, 1))}
+    made_from = replace(recording, time=np.arange(n) * 0.01, **rest)
+    write_estimate(tmp_path / "walk.h5", sd.estimate(made_from))
+    assert read_estimate(tmp_path / "walk.h5").table()["time_ns"][3] == 1_700_000_000_030_000_001
+    np.testing.assert_array_equal(sd.read_attitudes(tmp_path / "walk.h5").stamps_ns, made_from.clock_ns)
 
 
 def test_a_table_says_all_in_its_names(case):

@@ -170,9 +170,10 @@ def _own(path: Path, kind: str) -> Attitudes:
                 variance = reading.numbers(file, "variance")
                 P = variance[:, :, None] * np.eye(variance.shape[1])
             bias = reading.numbers(file, "bias") if "bias" in file else None
+            origin = recordfiles.origin_of(reading.attributes(file), path)
         return Attitudes(
             source=path.name,
-            stamps_ns=whole_ns(arrays["time"]),
+            stamps_ns=whole_ns(arrays["time"]) + (0 if origin is None else origin.epoch_ns),
             attitude=quaternion.normalize(arrays["attitude"]),
             covariance=P,
             error_frame="" if P is None else "body",

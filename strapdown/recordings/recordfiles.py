@@ -123,6 +123,7 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
         "seed": origin.seed,
         "run": origin.run,
         "source": origin.source or None,
+        "epoch_ns": origin.epoch_ns or None,
     }
     return {name: value for name, value in attributes.items() if value is not None}
 
@@ -133,7 +134,7 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
     ``source`` is that of an origin whose attributes do not name one.
     """
     origin: dict[str, Any] = {
-        name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
+        name: count(name, attributes[name], minimum=0) for name in ("seed", "run", "epoch_ns") if name in attributes
     }
     if "gyro" in attributes:
         origin["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")

@@ -131,7 +131,7 @@ def write_tum(estimate: Estimate, path: Path, *, recording: Recording | None, fr
     """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
     table = estimate.table(frame=frame)
     q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
-    stamps = whole_ns(estimate.time) + (0 if recording is None else recording.epoch_ns)
+    stamps = whole_ns(estimate.time) + estimate.epoch_ns(recording)
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write("# time tx ty tz qx qy qz qw\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):

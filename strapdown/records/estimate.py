@@ -469,6 +469,21 @@ class Estimate(ByValue, Listed):
         """
         return outputs.heading(self.attitude, self.attitude_covariance, axis=axis)
 
+    def epoch_ns(self, recording: Recording | None = None) -> int:
+        """Return the reading of the recording's clock at time 0.
+
+        Parameters
+        ----------
+        recording : Recording, optional
+            Recording that the estimate was made from. Default: as the origin says.
+
+        Returns
+        -------
+        int
+            ns since 1970; 0: unknown.
+        """
+        return (recording or self.origin or Origin()).epoch_ns
+
     def table(
         self, *, recording: Recording | None = None, sequence: str = "ZYX", frame: str = "ENU"
     ) -> dict[str, NDArray[np.generic]]:
@@ -495,8 +510,9 @@ class Estimate(ByValue, Listed):
         P = self.attitude_covariance
         q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
         columns: dict[str, NDArray[np.generic]] = {"time_s": self.time}
-        if recording is not None and recording.epoch_ns:
-            columns = {"time_ns": whole_ns(self.time) + recording.epoch_ns}
+        epoch = self.epoch_ns(recording)
+        if epoch:
+            columns = {"time_ns": whole_ns(self.time) + epoch}
         columns |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         axes = sequence.upper()

@@ -105,6 +105,8 @@ class Origin(ByValue):
         Run number of the random streams.
     source : str, default ""
         File or recording that it was read from; empty for a record in memory.
+    epoch_ns : int, default 0
+        Reading of the recording's clock at time 0, ns since 1970; 0: unknown.
     """
 
     gyro: GyroSpec | None = None
@@ -112,6 +114,7 @@ class Origin(ByValue):
     seed: int | None = None
     run: int | None = None
     source: str = ""
+    epoch_ns: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -294,7 +294,7 @@ def _run_recording(
     estimate = dataclasses.replace(
         result.estimate,
         setup=dataclasses.replace(parameters.setup, gate=gate, robust=robust),
-        origin=Origin(source=used.source),
+        origin=Origin(source=used.source, epoch_ns=used.epoch_ns),
         truth=None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement),
         fixed_frame=fixed_frame(used),
         motion=motion,
