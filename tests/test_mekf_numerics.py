@@ -323,7 +323,7 @@ SHARP = {
     "0.1 arcsecond from anywhere": (0.1 * ARCSECOND, None, 1.8, 1e-3),
     "0.1 arcsecond from 3 rad": (0.1 * ARCSECOND, None, 3.0, 1e-3),
 }
-WITH_STATES = ("one of 1 nrad", "from 3 rad")
+WITH_STATES = ("1 arcsecond", "one of 1 nrad", "from 3 rad")
 """With error states in the default run; the reference takes a second."""
 
 

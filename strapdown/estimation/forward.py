@@ -596,6 +596,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         length=lengths(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
+        root=np.zeros(kernels.N**2),
     )
     put_state(body, initial)
     return body

@@ -106,6 +106,8 @@ RESIDUAL, VARIANCE = N, N + 1
 
 SHORT_FORM = 100.0
 """Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses at most two digits."""
+JOSEPH_FORM = 1e8
+"""Maximum ratio for Joseph's form, whose rounding is up to 2e-8 of the measurement's variance at this ratio."""
 SERIES = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
 """1/16! to 1/2!."""
 NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
@@ -119,6 +121,7 @@ CALLED = (
     "write_transition",
     "take_precisely",
     "take_row",
+    "inner_product",
     "fill_coefficients",
     *(f"write_{s}" for s in range(len(STRUCTURE.sensors))),
 )
@@ -1129,17 +1132,22 @@ def apply_gains(x, P, work, gain, step, like):
     A vector of carried states is defined in the axes of the *estimated* attitude: a correction that rotates the attitude by A in fixed axes
     changes it to A c, and its error likewise.
     """
+    rotate_covariance(P, work, gain, *correct_state(x, work, step, like), like)
+
+
+def correct_state(x, work, step, like):
+    """Correct the state by a step; return the transformations of the errors of attitude and carried vectors."""
     step, before = kept(step, work, LINE * STEP), tuple_at(x, 0, 4, like)
     both = turned_by(before, tuple(entry(step, work, LINE * STEP, a) for a in AXES))
     q, G = both[:4], both[4:]
     add_step(x, step, work, like)
-    A = fixed_turn(before, q) if STRUCTURE.vectors else None
+    A = fixed_turn(before, q) if STRUCTURE.vectors else ()
     for v in STRUCTURE.vectors:
         for k, t in zip(v, matrix_times_vector(A, tuple(value_at(x, 1 + k, like) for k in v)), strict=True):
             put_at(x, 1 + k, t)
     for i, t in enumerate(q):
         put_at(x, i, t)
-    rotate_covariance(P, work, gain, G, A, like)
+    return G, A
 
 
 def add_step(x, step, work, like):
@@ -1192,7 +1200,7 @@ def rotate_covariance(P, work, gain, G, A, like):
                     put_element(P, i, j, whole[i, j])
 
 
-# ---------------------------------------------------------------------------------------- very precise measurements, by Joseph's form
+# -------------------------------------------------------------------------- very precise measurements, by Joseph's form or a root of P
 
 
 def store_rows(s, x, work, measured, numbers, transverse, like):
@@ -1295,17 +1303,85 @@ def clear_step(work, like):
         put_at(work, LINE * STEP + i, like)
 
 
-def take_precisely(x, P, work, rows, like):
-    """Update with the rows in the work space, one after the other; return whether one was too precise for double precision."""
+def take_precisely(x, P, work, root, rows, like):
+    """Update with the rows in the work space, one after the other; return whether one was too precise for double precision.
+
+    In lanes and in exported code, by Joseph's form only.
+    """
     clear_step(work, like)
     lost = like < 0.0  # false, of the type of the lanes
+    by_root = LANES == 1 and exceeds_joseph_form(work, rows)
+    if LANES == 1 and by_root:
+        factor_covariance(P, root)
     for i in range(rows):
         line = LINE * (ROWS + i)
         variance = value_at(work, line + VARIANCE, like)
-        _, s = take_row(P, work, ROWS + i, value_at(work, line + RESIDUAL, like), variance, like)
+        if LANES == 1 and by_root:
+            s = take_row_by_root(root, work, line)
+        else:
+            _, s = take_row(P, work, ROWS + i, value_at(work, line + RESIDUAL, like), variance, like)
         lost = lost | (s > MAX_PRECISION * variance)
-    apply_step(x, P, work, like)
+    G, A = correct_state(x, work, stored_step(work, like), like)
+    if LANES == 1 and by_root:
+        turn_root(P, root, G, A)
+    else:
+        rotate_covariance(P, work, (), G, A, like)
     return any_lane(lost)
+
+
+def exceeds_joseph_form(work, rows):
+    """Return whether a row is too precise for Joseph's form; :func:`gains` has written P h."""
+    far = False
+    for r in range(rows):
+        row = LINE * (ROWS + r)
+        far = far or inner_product(work, row, 1, work, LINE * (FACTORS + r), 1, N) > JOSEPH_FORM * work[row + VARIANCE]
+    return far
+
+
+def inner_product(a, i, stride, b, j, step, count):
+    """Return the inner product of every ``stride``-th number of a from the i-th on, and every ``step``-th of b from the j-th on."""
+    s = 0.0
+    for k in range(count):
+        s += a[i + stride * k] * b[j + step * k]
+    return s
+
+
+def factor_covariance(P, root):
+    """Write a root of P (Cholesky), unless P is still its square; of a state that those before it determine, a line of zeros."""
+    changed = False
+    for i in range(N):
+        for j in range(N):
+            changed = changed or P[W * i + j] != inner_product(root, i, N, root, j, N, N)
+    for k in range(N if changed else 0):
+        pivot = P[W * k + k] - inner_product(root, k, N, root, k, N, k)
+        share = 1.0 / math.sqrt(pivot) if MAX_PRECISION * pivot > P[W * k + k] else 0.0
+        for i in range(N):
+            root[N * k + i] = share * (P[W * k + i] - inner_product(root, k, N, root, i, N, k)) if i >= k else 0.0
+
+
+def take_row_by_root(root, work, row):
+    """Update root and step with a row in the work space; return the innovation's variance (Potter: Bierman 1977, section V.3)."""
+    f, step, variance = LINE * PRODUCT, LINE * STEP, work[row + VARIANCE]
+    error = work[row + RESIDUAL] - inner_product(work, row, 1, work, step, 1, N)
+    for k in range(N):
+        work[f + k] = inner_product(root, N * k, 1, work, row, 1, N)
+    s = variance + inner_product(work, f, 1, work, f, 1, N)
+    for i in range(N):
+        p = inner_product(root, i, N, work, f, 1, N) / s
+        work[step + i] += error * p
+        for k in range(N):
+            root[N * k + i] -= p / (1.0 + math.sqrt(variance / s)) * work[f + k]
+    return s
+
+
+def turn_root(P, root, G, A):
+    """Transform a root to the new tangent space, and write P, its square."""
+    for k in range(0, N * N, N):
+        root[k], root[k + 1], root[k + 2] = matrix_times_vector(G, (root[k], root[k + 1], root[k + 2]))
+        rotate_vectors(root, k, A)
+    for i in range(N):
+        for j in range(N):
+            P[W * i + j] = inner_product(root, i, N, root, j, N, N)
 
 
 def take_precisely_in_lanes(body, gain, step, precise, rows, like):
@@ -1314,7 +1390,7 @@ def take_precisely_in_lanes(body, gain, step, precise, rows, like):
     copy_values(x[0], x[1], N + 1, like)
     copy_values(P[0], P[1], SIZE_OF_P // LANES, like)
     apply_gains(x[0], P[0], body.work, gain, step, like)
-    lost = take_precisely(x[1], P[1], body.work, rows, like)
+    lost = take_precisely(x[1], P[1], body.work, body.root, rows, like)
     blend_values(x[1], x[0], precise, N + 1, like)
     blend_values(P[1], P[0], precise, SIZE_OF_P // LANES, like)
     return lost
@@ -1334,11 +1410,15 @@ def blend_values(a, b, condition, count, like):
 
 def apply_step(x, P, work, like):
     """Correct the state by the step in the work space, and transform the covariance."""
-    step = tuple(
+    apply_gains(x, P, work, (), stored_step(work, like), like)
+
+
+def stored_step(work, like):
+    """Return the step in the work space, by parts."""
+    return tuple(
         load_like(work, LINE * STEP + c, lanes_of(EIGHT)) if LANES == 1 else value_at(work, LINE * STEP + c, like)
         for c in PARTS
     )
-    apply_gains(x, P, work, (), step, like)
 
 
 # --------------------------------------------------------------------------------------- updates by shape, which is known while compiling
@@ -1385,7 +1465,7 @@ def judge_{s}(body, measured, e, options, like):
         if any_lane(g.precise):
             rows_{s}(body.x[0], body, measured, e, like)
             divide_variances(body.work, {rows}, weight, like)
-            lost = take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
+            lost = take_precisely(body.x[0], body.P[0], body.work, body.root, {rows}, like)
         else:
             apply_gains(body.x[0], body.P[0], body.work, g.gain, g.step, like)
     return outcome, weight, errors, variances, lost
@@ -1417,7 +1497,7 @@ def _dispatch(name: str, arguments: str, otherwise: str) -> str:
 
 # In lanes a run that needs Joseph's form must not change the bits of those beside it.
 _PRECISE = {
-    True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
+    True: "take_precisely(body.x[0], body.P[0], body.work, body.root, {rows}, like)",
     False: "take_precisely_in_lanes(body, g.gain, g.step, g.precise, {rows}, like)",
 }[LANES == 1]
 _ROW = "measured.place[e]" if LANES == 1 else "0"  # the first row if another kernel takes the innovations from there

@@ -133,6 +133,8 @@ class Body(NamedTuple):
     """Effect e of each error state on the gyro as an offset (m, 3), for the whole bias."""
     factors: np.ndarray = np.empty(0)
     """Factor on σ about each body axis of each sensor (sensors × 3 × runs), of runs that differ in noise."""
+    root: np.ndarray = np.empty(0)
+    """Lines r of a root of P, ``P = Σ r rᵀ`` (N²), of one run."""
 
 
 class Outputs(NamedTuple):
