@@ -54,22 +54,19 @@ def test_help_shows_options_in_groups_and_examples_that_parse(run):
         assert unit in said
 
 
-def test_a_command_whose_reader_has_left_still_writes_its_files(tmp_path):
-    """As ``strapdown coning-budget … | head`` does: nothing can be printed, and the file is whole."""
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_command_whose_reader_has_left_still_writes_its_numbers(tmp_path, closed):
+    """As ``strapdown coning-budget … | head`` does: nothing can be printed, and the file, or what goes to the other stream, is whole."""
     (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg,phase_deg\n20,0.02,90\n")
     ending, beginning = os.pipe()
     os.close(ending)
-    arguments = ["coning-budget", "--psd", "lines.csv", "--rate", "1000", "--json", "budget.json"]
-    ended = subprocess.run(
-        [sys.executable, "-m", "strapdown", *arguments],
-        cwd=tmp_path,
-        stdout=beginning,
-        stderr=subprocess.PIPE,
-        check=False,
-    )
+    numbers = {"stdout": "budget.json", "stderr": "-"}[closed]
+    arguments = ["coning-budget", "--psd", "lines.csv", "--rate", "1000", "--json", numbers]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, closed: beginning}
+    ended = subprocess.run([sys.executable, "-m", "strapdown", *arguments], cwd=tmp_path, check=False, **streams)
     os.close(beginning)
-    assert (ended.returncode, ended.stderr) == (0, b"")
-    assert json.loads((tmp_path / "budget.json").read_text())
+    assert (ended.returncode, ended.stderr or b"") == (0, b"")
+    assert json.loads((tmp_path / numbers).read_text() if closed == "stdout" else ended.stdout)
 
 
 def test_unknown_commands_and_options_end_with_status_2(refusal, tmp_path):

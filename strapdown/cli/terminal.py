@@ -61,7 +61,7 @@ class PlainConsole(Console):
         """Print nothing more and go on, so that a command whose output goes to ``head`` still writes its files."""
         self.quiet = True
         with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # for what Python flushes at the end
+            os.dup2(nowhere.fileno(), self.file.fileno())  # for what Python flushes at the end
 
 
 app = typer.Typer(
