@@ -93,8 +93,7 @@ def _judged_foreign(
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
     own = sd.read_attitudes(result, topic=topic)
     if reading.kind(result) == "strapdown estimate":
-        held: Any = sd.read(result)
-        own = replace(own, innovations=held.innovations, motion=held.motion)
+        own = replace(own, innovations=sd.read(result).innovations)  # type: ignore[union-attr]
     truth = None if options.truth is None else sd.read_attitudes(options.truth)
     how |= {"error_frame": options.error_frame, "align": options.align}
     checked = sd.consistency.check_attitudes(own, truth, **how)

@@ -194,6 +194,7 @@ def check_attitudes(
                 "time"
             )
         estimate = without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+        estimate = replace(estimate, motion=own.motion)
         return Checked(judgement=judge(estimate, **how), estimate=estimate)
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
     origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
@@ -233,7 +234,7 @@ def _checked(
     remarks += alignment.words
     aligned = in_truth_frames(own.attitude, alignment)
     if own.covariance is None:
-        estimate = without_truth(own.time, aligned, innovations)
+        estimate = replace(without_truth(own.time, aligned, innovations), motion=motion)
         judgement = judge(estimate, truth, **how)
         frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:

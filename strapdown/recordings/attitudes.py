@@ -170,7 +170,8 @@ def _own(path: Path, kind: str) -> Attitudes:
                 variance = reading.numbers(file, "variance")
                 P = variance[:, :, None] * np.eye(variance.shape[1])
             bias = reading.numbers(file, "bias") if "bias" in file else None
-            origin = recordfiles.origin_of(reading.attributes(file), path)
+            attributes = reading.attributes(file)
+        origin = recordfiles.origin_of(attributes, path)
         return Attitudes(
             source=path.name,
             stamps_ns=whole_ns(arrays["time"]) + (0 if origin is None else origin.epoch_ns),
@@ -178,6 +179,7 @@ def _own(path: Path, kind: str) -> Attitudes:
             covariance=P,
             error_frame="" if P is None else "body",
             bias=bias,
+            motion=str(attributes.get("motion", "")),
         )
     if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)
