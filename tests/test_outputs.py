@@ -141,7 +141,12 @@ def test_the_file_of_an_estimate_keeps_the_clock(case, tmp_path):
     made_from = replace(recording, time=np.arange(n) * 0.01, **rest)
     write_estimate(tmp_path / "walk.h5", sd.estimate(made_from))
     assert read_estimate(tmp_path / "walk.h5").table()["time_ns"][3] == 1_700_000_000_030_000_001
-    np.testing.assert_array_equal(sd.read_attitudes(tmp_path / "walk.h5").stamps_ns, made_from.clock_ns)
+    attitudes_of_file = sd.read_attitudes(tmp_path / "walk.h5")
+    np.testing.assert_array_equal(attitudes_of_file.stamps_ns, made_from.clock_ns)
+    assert attitudes_of_file.motion == "hand"  # whose σ are upper bounds
+    before_1970 = sd.integrate(replace(made_from, epoch_ns=-5_000_000_000))
+    write_estimate(tmp_path / "walk.h5", before_1970)
+    assert read_estimate(tmp_path / "walk.h5").origin.epoch_ns == -5_000_000_000
 
 
 def test_a_table_says_all_in_its_names(case):

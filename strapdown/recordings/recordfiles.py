@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -134,8 +135,10 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
     ``source`` is that of an origin whose attributes do not name one.
     """
     origin: dict[str, Any] = {
-        name: count(name, attributes[name], minimum=0) for name in ("seed", "run", "epoch_ns") if name in attributes
+        name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
+    if "epoch_ns" in attributes:
+        origin["epoch_ns"] = count("epoch_ns", attributes["epoch_ns"], minimum=-sys.maxsize)
     if "gyro" in attributes:
         origin["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")
     if origin or attributes.keys() & {"scenario", "source"}:

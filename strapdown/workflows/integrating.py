@@ -76,7 +76,9 @@ def integrate(
         bias=np.broadcast_to(np.nan, (len(steps), 3)),
         variance=np.broadcast_to(np.nan, (len(steps), 6)),
         covariance=np.broadcast_to(np.nan, (len(steps), 6, 6)),
-        origin=source.origin if isinstance(source, ImuRecord) else Origin(source=source.source),
+        origin=source.origin
+        if isinstance(source, ImuRecord)
+        else Origin(source=source.source, epoch_ns=source.epoch_ns),
         remarks=tuple(filter(None, remarks)),
         details={"algorithm": rule.name},
     )

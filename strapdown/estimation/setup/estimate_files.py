@@ -26,7 +26,7 @@ _VALUES = {
     "covariance": "rad^2, rad^2/s, (rad/s)^2",
     "whole_covariance": "of attitude, bias and error states, in their units",
 }
-_ORIGIN = ("gyro", "scenario", "seed", "run", "source")
+_ORIGIN = ("gyro", "scenario", "seed", "run", "source", "epoch_ns")
 _CONTEXT = ("kind", "version", "conventions", "filter", "fixed_frame", "motion", "smoothed", "remarks", *_ORIGIN)
 
 
