@@ -168,8 +168,9 @@ TABLE = [
     (
         GyroScale,
         {"scale_sigma": 0.01, "misalignment_sigma": np.triu(np.ones((3, 3)), 1), "symmetric": True},
-        "misalignment_sigma of xy and yx differ",
+        "misalignment_sigma of xy is 1, of yx 0",
     ),
+    (GyroScale, {"scale_sigma": 0.01, "misalignment_sigma": 0.01, "symmetric": "false"}, "symmetric is 'false'"),
     (GyroForce, {"along_sigma": 0.0}, "along_sigma and across_sigma are both 0"),
     (LeverArm, {"sensor": "acc", "arm_sigma": 0.0}, "arm_sigma is 0"),
     (LeverArm, {"sensor": "acc", "arm_sigma": [0.1, -1.0, 0.0]}, "arm_sigma[1] is -1 m"),

@@ -188,9 +188,10 @@ def _pairs(name: str, sigma: dict[str, float]) -> tuple[tuple[str, ...], Array]:
     pairs = {}
     for entry, value in sigma.items():
         opposite = entry[::-1]
-        if sigma.get(opposite) != value:
+        other = sigma.get(opposite, 0.0)
+        if other != value:
             raise InputError(
-                f"{name}: misalignment_sigma of {entry} and {opposite} differ; they are one state of a symmetric matrix"
+                f"{name}: misalignment_sigma of {entry} is {value:g}, of {opposite} {other:g}; give equal ones, or leave symmetric out"
             )
         pairs[entry if entry == opposite else "=".join(sorted((entry, opposite)))] = value
     return tuple(pairs), np.array(list(pairs.values()))
@@ -229,6 +230,8 @@ class GyroScale(ErrorStates):
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
         fields = ("scale_sigma", "misalignment_sigma")
         components, sigma = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, fields)
+        if not isinstance(self.symmetric, bool):
+            raise InputError(f"{self.name}: symmetric is {self.symmetric!r}; it must be true or false")
         if self.symmetric:
             components, sigma = _pairs(self.name, dict(zip(components, sigma, strict=True)))
         self._set(
