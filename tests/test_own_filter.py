@@ -333,10 +333,17 @@ def test_bad_filters_are_refused():
     def half(record, initial):
         return wrapped(cut(record, 0, len(record.increments) // 2), initial)
 
+    def late(record, initial):
+        return wrapped(cut(record, len(record.increments) // 2, len(record.increments)), initial)
+
     for bad, message in (
         (lambda record, initial: 3, "return Estimate.from_arrays"),
         (shifted, "time\\[0\\] is 0.01 s, where the record has no edge"),
-        (half, "half ends at [0-9.]+ s, [0-9.]+ s before the record; return values up to its end"),
+        (
+            half,
+            "half gives values from 0 to [0-9.]+ s, and the record goes from 0 to [0-9.]+ s; return values over all of it",
+        ),
+        (late, "late gives values from [0-9.]+ to"),
     ):
         with pytest.raises(InputError, match=message):
             montecarlo.run_plan(with_filter(bad), runs=1)

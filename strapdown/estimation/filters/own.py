@@ -248,12 +248,12 @@ def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -
         raise InputError(
             f"{name}: time[{k}] is {time[k]:.9g} s, where the record has no edge; return values at record.time"
         )
-    missing = record.time[-1] - time[-1]
-    if missing > 1.5 * np.max(
-        np.diff(time), initial=record.intervals.max()
-    ):  # one step: without the first or last edge
+    step = np.median(np.diff(time)) if len(time) > 1 else 0.0
+    most = 1.5 * max(step, record.intervals.max())  # one step: without the first or the last edge
+    if record.time[-1] - time[-1] > most or time[0] - record.time[0] > most:
         raise InputError(
-            f"{name} ends at {time[-1]:.9g} s, {missing:.3g} s before the record; return values up to its end, NaN after a failure"
+            f"{name} gives values from {time[0]:.9g} to {time[-1]:.9g} s, and the record goes from {record.time[0]:.9g} to "
+            f"{record.time[-1]:.9g} s; return values over all of it, NaN after a failure"
         )
     for what, width in (("attitude", 4), ("bias", 3), ("variance", 6)):
         array(f"{name}: {what}", np.nan_to_num(getattr(estimate, what)), (len(time), width))
