@@ -2,7 +2,7 @@
 
 Each gets the same samples one at a time, as lists or arrays, whichever is faster for it: gyro, accelerometer, magnetometer. The filters
 differ in their states and purpose; the table compares only their run time. smsfusion and AttiPy use a heading in place of the
-magnetometer. `LiveAhrs` updates its 21 states every 30 ms, with the mean of three samples.
+magnetometer. `LiveAhrs` updates its 18 states every 30 ms, with the mean of three samples.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
         "the same, gate": (live(gate=Gate()), n),
         "the same, look-back of 0.5 s": (live(look_back=0.5), n),
         "the same, nine error states": (live(error_states=(GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)), n),
-        "strapdown LiveAhrs, gyro and accelerometer, 21 states": (samples, n),
-        "strapdown LiveAhrs, and magnetometer, 27 states": (with_field, n),
+        "strapdown LiveAhrs, gyro and accelerometer, 18 states": (samples, n),
+        "strapdown LiveAhrs, and magnetometer, 24 states": (with_field, n),
         "strapdown StepFilter on filterpy, two vectors": (steps, 500),
     }
 
