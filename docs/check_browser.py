@@ -46,7 +46,7 @@ addEventListener("load", () => {
   }
   // The page and the theme's container of the text, which would scroll instead of it.
   const scrolled = [document.documentElement, document.querySelector(".content")];
-  found.overflow = Math.max(...scrolled.map((one) => one.scrollWidth - one.clientWidth));
+  found.overflow = Math.max(...scrolled.map((element) => element.scrollWidth - element.clientWidth));
   document.title = JSON.stringify(found);
 });
 """

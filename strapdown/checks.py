@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import os
 import re
 import reprlib
 from collections.abc import Callable, Iterable, Sequence
@@ -335,7 +336,9 @@ def instance(name: str, value: object, wanted: type | tuple[type, ...], remedy: 
     if not isinstance(value, wanted):
         classes = " or ".join(kind.__name__ for kind in (wanted if isinstance(wanted, tuple) else (wanted,)))
         # An object of this package is described by several lines.
-        plain = value is None or isinstance(value, (str, int, float, complex, list, tuple, dict, set, type, np.ndarray))
+        plain = value is None or isinstance(
+            value, (str, os.PathLike, int, float, complex, list, tuple, dict, set, type, np.ndarray)
+        )
         what = reprlib.repr(value) if plain else f"of class {type(value).__name__}"
         raise InputError(f"{name} is {what}, not of class {classes}; {remedy}")
 

@@ -79,7 +79,7 @@ def montecarlo(
         _replay(plan, replay, computing.machine, target)
         return None
     new = held is None or target != source or computing.resume or computing.overwrite
-    result = _computed(plan, target, source.stem, computing) if new or held is None else held
+    result = held if held is not None and not new else _computed(plan, target, source.stem, computing)
     ui.show(sd.check(result).listing(), title=ui.EVIDENCE)
     content = result.summary()
     ui.show(*verdicts.tables(content))

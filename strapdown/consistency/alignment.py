@@ -62,7 +62,7 @@ class Alignment:
         """Differences that were removed, one sentence each."""
         words = []
         if "time" in self.estimated:
-            # One clock may count from 1970: at least to a tenth of σ.
+            # Digits down to a tenth of σ, also if one clock counts from 1970.
             digits = max(6.0, 2.0 + np.ceil(np.log10(max(abs(self.offset), 1e-9) / max(self.sigma[6], 1e-9))))
             words.append(
                 f"clocks differ by {self.offset:.{int(digits)}g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"

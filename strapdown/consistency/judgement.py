@@ -347,7 +347,7 @@ def _one_sided(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _bounded(judged: Judgement, estimate: Estimate, truth: Truth | None) -> Judgement:
-    """Return the verdict by one-sided tests of the ratios of a filter whose σ are upper bounds, with the ratios that it tests."""
+    """Return the verdict by one-sided tests of the ratios of a filter whose σ are upper bounds, and name these ratios."""
     findings = tuple(replace(finding, low=0.0) for finding in judged.findings)
     judged = replace(judged, findings=findings)
     if judged.verdict == "not consistent" or not findings:

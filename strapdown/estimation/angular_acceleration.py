@@ -67,7 +67,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
 
 
 def _best_window(rates: Array, white: Array, dt: float) -> tuple[int, int, Array, Array]:
-    """Return order and window of the slope with the smallest sum of variances (3,), that of noise and that of bias, and both.
+    """Return order and window of the slope whose variance, the sum of those of noise and of bias, is smallest, and these two (3,).
 
     ``white`` (3,) is the variance of the gyro's noise in a sample.
     """

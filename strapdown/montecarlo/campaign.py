@@ -207,13 +207,12 @@ def run(
     Raises
     ------
     InputError
-        If the file exists without ``resume`` or ``overwrite``, except a campaign without a finished run, is of another plan, or is no
-        campaign.
+        If a new campaign would destroy the runs of the file, or if the one to be resumed is of another plan, or no campaign.
     """
     target = Path(path)
     count("runs", runs)
     table = plan.to_table()
-    if not resume and not overwrite and _has_runs(target):
+    if not resume and not overwrite and _would_lose(target):
         raise InputError(
             f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
@@ -245,7 +244,7 @@ def run(
         return _compute(start, target, table, in_threads(threads) if workers is None else workers, advanced)
 
 
-def _has_runs(path: Path) -> bool:
+def _would_lose(path: Path) -> bool:
     """Return whether there is a file that a new campaign would destroy: any but a campaign of which no run is finished."""
     try:
         return path.exists() and read(path).finished_runs > 0

@@ -207,11 +207,11 @@ def _roles(
         cells = {column.said.lower(): k for k, column in enumerate(columns)} | {name: k for k, name in enumerate(names)}
         index = cells.get(cell.lower(), cells.get(wanted.name.lower()))
         if index is None:
-            group = next(group for group, members in GROUPS.items() if role in members)
+            known = UNITS.get(_group(role))
             bare = re.sub(r"\s*[\[(][^\[(]*$", "", cell).lower()
-            if bare in names and group in UNITS:  # brackets that hold no unit
+            if bare in names and known:  # brackets that hold no unit
                 raise InputError(
-                    f"{source}: columns: the unit in {cell!r} for {role} is not known (known: {', '.join(UNITS[group])})"
+                    f"{source}: columns: the unit in {cell!r} for {role} is not known (known: {', '.join(known)})"
                 )
             raise InputError(
                 f"{source} has no column {cell!r} for {role} (it has: {', '.join(c.name for c in columns)})"
