@@ -1,6 +1,7 @@
 """Sphinx extension of the pages: cells as one would paste them, and text generated from the package.
 
 - A cell of Bash is shown without its magic, a cell that writes a file as the file, with the file's name as caption.
+- No line ends between a formula and the punctuation after it, nor between a quantity in the head of a table and its unit.
 - ``{generated} module.function argument…`` inserts the Markdown that a function beside this file returns; its headings are the page's own.
 """
 
@@ -44,6 +45,19 @@ def show_cells(app: Any, document: nodes.document) -> None:
             _replace(block, content, {".csv": "text"}.get(PurePath(name).suffix, PurePath(name).suffix[1:]))
 
 
+def keep_together(app: Any, document: nodes.document) -> None:
+    """Let no line end between a formula and its punctuation, nor, in the head of a table, before a unit (a short last word)."""
+    for formula in list(document.findall(nodes.math)):
+        text = formula.next_node(descend=False, siblings=True)
+        if isinstance(text, nodes.Text) and (mark := re.match(r"[.,;:)]+", text)):
+            formula.replace_self(box := nodes.inline(classes=["nowrap"]))
+            box += [formula, nodes.Text(mark.group())]
+            text.parent.replace(text, nodes.Text(text[mark.end() :]))
+    for head in list(document.findall(nodes.thead)):
+        for text in list(head.findall(nodes.Text)):
+            text.parent.replace(text, nodes.Text(re.sub(r", (?=\S{1,7}$)", ",\N{NO-BREAK SPACE}", text)))
+
+
 def _replace(block: nodes.literal_block, content: str, language: str) -> None:
     block.clear()
     block += nodes.Text(content)
@@ -54,4 +68,5 @@ def setup(app: Any) -> dict[str, bool]:
     """Register the extension."""
     app.add_directive("generated", Generated)
     app.connect("doctree-read", show_cells)
+    app.connect("doctree-read", keep_together)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
