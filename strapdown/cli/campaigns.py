@@ -157,11 +157,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
     ui.check_files(*paths)
     again = sd.montecarlo.replay(plan, run, machine=machine)
-    sd.write(again.record, paths[0])
-    sd.write(again.estimate, paths[1])
     nees, worst = again.largest_nees(plan.time)
     ui.say(
         f"Run {run} of seed {plan.seed}, machine: {sd.montecarlo.choose(plan, machine)}. Its maximum NEES of the states at the "
         f"{plan.epochs} epochs of the campaign is {nees:.1f}, at {worst:g} s."
     )
-    ui.written(*paths)
+    ui.written(sd.write(again.record, paths[0]), sd.write(again.estimate, paths[1]))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
@@ -14,9 +13,6 @@ from strapdown.checks import InputError, non_negative
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import FILTER, FORMAT, GYRO, RECORDING_HELP, STATES, Format, Layout, numbers, options_given
 from strapdown.files import write_json
-
-if TYPE_CHECKING:
-    from strapdown.workflows.estimating import Run
 
 FIGURES = tuple(f"{name}.{form}" for name in ("estimate", "errors", "states") for form in ("png", "pdf", "svg"))
 NUMBERS = tuple(f"{name}.json" for name in ("errors", "states", "observability", "field"))
@@ -129,32 +125,6 @@ def _options(shared: _Shared, specified: _Specified, recorded: _Recorded) -> dic
     }
 
 
-def _parts(run: Run, result: sd.records.Estimate, *, observability: bool) -> dict[str, Any]:
-    """Return the observability, if asked for, and the errors, if there is a truth, by the names of their files."""
-    parts: dict[str, Any] = {}
-    if observability:
-        with ui.progress_bar("observability"):
-            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
-    if result.truth is not None:
-        parts["errors.json"] = sd.accuracy(result)
-    return parts
-
-
-def _save(out: Path, run: Run, result: sd.records.Estimate, contents: Mapping[str, Any], source: str) -> list[Path]:
-    """Write the estimate, further numbers and a new calibration to a folder, and return the files."""
-    for name in FILES[1:]:  # of an earlier estimate; this one may not write all of them
-        (out / name).unlink(missing_ok=True)
-    paths = [sd.write(result, out / FILES[0])]
-    for file, content in contents.items():
-        write_json(out / file, {"source": source, **content})
-        paths.append(out / file)
-    new = None if run.recorded is None else run.recorded.calibration
-    if new is not None:
-        paths.append(out / "calibration.toml")
-        sd.calibration.write(new, paths[-1])
-    return paths
-
-
 @ui.command()
 def estimate(
     *,
@@ -190,7 +160,12 @@ def estimate(
     result = run.estimate if field is None else field.to_true_north(run.estimate)
     ui.say(*result.remarks)
     ui.show(result.listing())
-    parts = _parts(run, result, observability=shared.observability)
+    parts: dict[str, Any] = {}
+    if shared.observability:
+        with ui.progress_bar("observability"):
+            parts["observability.json"] = sd.estimation.setup.observability(run.record, run.setup, run.initial)
+    if result.truth is not None:
+        parts["errors.json"] = sd.accuracy(result)
     ui.show(*(part.listing() for part in parts.values()))
     if field is not None:
         parts["field.json"] = field.compared(source, result)
@@ -198,7 +173,16 @@ def estimate(
     contents = {file: part.summary() for file, part in parts.items()}
     if result.error_states:
         contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
-    paths = _save(out, run, result, contents, recording.name)
+    for name in FILES[1:]:  # of an earlier estimate; this one may not write all of them
+        (out / name).unlink(missing_ok=True)
+    paths = [sd.write(result, out / FILES[0])]
+    for file, content in contents.items():
+        write_json(out / file, {"source": recording.name, **content})
+        paths.append(out / file)
+    new = None if run.recorded is None else run.recorded.calibration
+    if new is not None:
+        paths.append(out / "calibration.toml")
+        sd.calibration.write(new, paths[-1])
     paths += [sd.write(result, to, recording=None if simulated else source, **how) for to, how in exports.items()]
     if form is not None:
         paths += sd.plots.draw_estimate(result, out, form, title=recording.name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
@@ -13,11 +13,6 @@ from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import options_given
 from strapdown.files import reading
-
-if TYPE_CHECKING:
-    from strapdown.consistency import Judgement
-    from strapdown.records import Estimate
-    from strapdown.tuning.diagnosis import Diagnosis
 
 
 @dataclass(frozen=True)
@@ -87,9 +82,7 @@ def check(
     return content | judgement.summary()
 
 
-def _judged_foreign(
-    result: Path, topic: str, options: _Foreign, how: dict[str, Any]
-) -> tuple[Judgement, dict[str, Any]]:
+def _judged_foreign(result: Path, topic: str, options: _Foreign, how: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
     own = sd.read_attitudes(result, topic=topic)
     if reading.kind(result) == "strapdown estimate":
@@ -106,7 +99,7 @@ def _judged_foreign(
     return checked.judgement, {"source": own.source, "kind": "estimate from elsewhere", **checked.summary()}
 
 
-def _diagnosed(held: Estimate, record: Path, judgement: Judgement) -> tuple[dict[str, Any], Diagnosis | None]:
+def _diagnosed(held: Any, record: Path, judgement: Any) -> tuple[dict[str, Any], Any]:
     """Print the causes found from a record; return them for JSON, and, if they count in the verdict, as they are."""
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings.recordfiles import read_record

@@ -107,9 +107,8 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
         def run(**values: Any) -> None:
             inputs = (value for name, value in values.items() if name not in OUTPUTS)
             paths = [path for value in inputs for path in (value if isinstance(value, list) else [value])]
-            _running.update(
-                name=function.__name__, paths=[path for path in paths if isinstance(path, (str, Path))], tables=[]
-            )
+            paths = [path for path in paths if isinstance(path, (str, Path))]
+            _running.update(name=function.__name__, paths=paths, tables=[])
             folder, target = (values.pop(name, None) for name in ("tables", "json"))
             printed = target == Path("-")
             if printed:  # all other output then goes to standard error
@@ -197,10 +196,9 @@ def check_files(
     writable(name, *paths, suffixes=suffixes, sources=_running["paths"] if reads else ())
     if not own or not paths[0].exists():
         return
-    try:
+    replaceable = False
+    with contextlib.suppress(InputError):
         replaceable = reading.kind(paths[0]) == own if isinstance(own, str) else own(paths[0])
-    except InputError:
-        replaceable = False
     if not replaceable:
         raise InputError(
             f"{paths[0]} exists and was not written by `strapdown {_running['name']}`; move it, or choose another --out"
@@ -209,8 +207,7 @@ def check_files(
 
 def written(*paths: Path) -> None:
     """Print which files were written."""
-    if paths:
-        console.print("Written: " + ", ".join(map(str, paths)))
+    say(f"Written: {', '.join(map(str, paths))}" if paths else "")
 
 
 LINE_INTERVAL = 10.0
@@ -243,9 +240,8 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[Callable[[int 
 
     bar = None
     if errors.is_terminal and not _quiet:
-        bar = bars.Progress(
-            *bars.Progress.get_default_columns(), bars.TimeElapsedColumn(), console=errors, transient=True
-        )
+        columns = (*bars.Progress.get_default_columns(), bars.TimeElapsedColumn())
+        bar = bars.Progress(*columns, console=errors, transient=True)
         task = bar.add_task(what, total=total)
     watcher = Thread(target=watch, daemon=True)
     with bar or contextlib.nullcontext():
