@@ -171,10 +171,9 @@ def _own(path: Path, kind: str) -> Attitudes:
                 P = variance[:, :, None] * np.eye(variance.shape[1])
             bias = reading.numbers(file, "bias") if "bias" in file else None
             attributes = reading.attributes(file)
-        origin = recordfiles.origin_of(attributes, path)
         return Attitudes(
             source=path.name,
-            stamps_ns=whole_ns(arrays["time"]) + (0 if origin is None else origin.epoch_ns),
+            stamps_ns=whole_ns(arrays["time"]) + recordfiles.epoch_of(attributes),
             attitude=quaternion.normalize(arrays["attitude"]),
             covariance=P,
             error_frame="" if P is None else "body",

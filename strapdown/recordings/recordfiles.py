@@ -138,7 +138,7 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
         name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
     if "epoch_ns" in attributes:
-        origin["epoch_ns"] = count("epoch_ns", attributes["epoch_ns"], minimum=-sys.maxsize)
+        origin["epoch_ns"] = epoch_of(attributes)
     if "gyro" in attributes:
         origin["gyro"] = gyro.from_table(reading.from_json(str(attributes["gyro"]), f"{path}: gyro"), f"{path}: gyro")
     if origin or attributes.keys() & {"scenario", "source"}:
@@ -151,6 +151,11 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
         origin["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
         origin.setdefault("gyro", origin["scenario"].gyro)
     return Origin(**origin) if origin else None
+
+
+def epoch_of(attributes: Mapping[str, Any]) -> int:
+    """Return the reading of the clock at time 0 in the attributes of a file, ns since 1970; 0: unknown."""
+    return count("epoch_ns", attributes.get("epoch_ns", 0), minimum=-sys.maxsize)
 
 
 def _values(group: Any, name: str, unit: str) -> Array:

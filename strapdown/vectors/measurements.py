@@ -169,7 +169,7 @@ class VectorMeasurements:
         return columns | {"sigma": sigma}
 
     def _noise_of_axes(self, m: int, missing: np.ndarray, known: Any) -> tuple[dict[str, Array], Array | None]:
-        """Return sigma_axes (m, 3) and covariance (m, 3, 3) those given, and σ of the axes (m, 3) from whichever is."""
+        """Return sigma_axes (m, 3) and covariance (m, 3, 3) if they are given, and σ of the axes (m, 3) from either."""
         columns: dict[str, Array] = {}
         axes: Array | None = None
         if self.sigma_axes is not None:
