@@ -234,8 +234,7 @@ def _checked(
     remarks += alignment.words
     aligned = in_truth_frames(own.attitude, alignment)
     if own.covariance is None:
-        estimate = replace(without_truth(own.time, aligned, innovations), motion=motion)
-        judgement = judge(estimate, truth, **how)
+        estimate = without_truth(own.time, aligned, innovations)
         frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:
         readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
@@ -247,14 +246,13 @@ def _checked(
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         turned = None if own.bias is None else quaternion.rotate(body, own.bias)
         estimate = Estimate.from_arrays(own.time, aligned, readings[frame], bias=turned, innovations=innovations)
-        estimate = replace(estimate, motion=motion)
-        judgement = judge(estimate, truth, **how)
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
         moved, level = Series(own.time, aligned, bias=own.bias), how["confidence_level"]
         explained = explanations(error, readings, frame, probabilities, truth, moved, confidence_level=level)
+    estimate = replace(estimate, motion=motion)
     return Checked(
-        judgement=judgement,
+        judgement=judge(estimate, truth, **how),
         estimate=replace(estimate, truth=truth),
         alignment=alignment,
         error_frame=frame,
