@@ -17,7 +17,7 @@ from strapdown.records.recording import Recording
 
 FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
-PAIRS_IN_SPAN = 12
+PAIRS_IN_SPAN = 6
 """Number of pairs of field samples per span; more are not independent."""
 MAX_DELAY_SIGMA = 2e-3
 """Maximum σ of a delay of the magnetometer that is used, s."""
