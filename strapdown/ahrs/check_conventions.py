@@ -504,7 +504,7 @@ def _windows(recording: Recording, sensors: _Sensors, step: int, known: np.ndarr
         return None
     window = np.floor((time - time[0]) / SPAN).astype(int)
     turning = np.bincount(window, lengths(recording.rate[::step])) / np.bincount(window).clip(1)
-    least = 0.5 * max(1.0, SPAN / median(np.diff(time)))
+    least = 0.5 * max(1.0, SPAN / (step * recording.interval))
     side_by_side, used = np.zeros((len(time), WIDTH)), {}
     for name, (samples, there, _, strength) in sensors.items():
         has_sample = there & known & (strength > 0.0)

@@ -244,10 +244,12 @@ def uncertain_turns(variance: Array) -> Array:
 
     It is added before the step, a smaller one than :data:`SMALL_TURN` squared with that of the next steps.
     """
+    added = np.zeros((len(variance) + 1, 3))
+    if not variance.any():
+        return added
     total = np.cumsum(variance, axis=0)
     level = np.floor(total.max(axis=1, initial=0.0) / SMALL_TURN**2)
     due = np.flatnonzero(np.diff(level, prepend=0.0) > 0.0)
-    added = np.zeros((len(variance) + 1, 3))
     added[due] = np.diff(total[due], axis=0, prepend=0.0)
     return added
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, is_definite
+from strapdown.checks import Array, InputError, count, is_definite, lengths
 from strapdown.estimation import model as modelling
 from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
@@ -593,7 +593,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         dt=np.zeros(1),
         work=aligned_zeros(kernels.LINES * kernels.LINE),
         shape=model.shape,
-        length=lengths(problem.record, problem.events, model, units),
+        length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
         root=np.zeros(kernels.N**2),
@@ -768,7 +768,7 @@ def turns(problem: Problem) -> Array:
     return np.concatenate([turns, np.where(levered[:, None], variance, 0.0)], axis=1)
 
 
-def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[str, float]) -> Array:
+def divisors(record: ImuRecord, events: Schedule, model: Model, units: Mapping[str, float]) -> Array:
     """Return the divisor of each measurement's effects, in order of time (events,).
 
     For kind ``"vector"`` it is the length of the reference; for a direction or heading with an effect that is constant in the sensor's own
@@ -781,7 +781,7 @@ def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[st
         mine = events.sensor == i
         which = np.searchsorted(series.time, events.time[mine])
         if series.kind == "vector":
-            result[mine] = np.linalg.norm(series.references_f[which], axis=1)
+            result[mine] = lengths(series.references_f)[which]
         else:
             result[mine] = (units[series.sensor] / level_sigma(series))[which]
     return result

@@ -20,7 +20,7 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.integration import large_exponential
 from strapdown.kernels.lane_values import WIDTH, broadcast, load
 from strapdown.kernels.measurement import quaternion_at, vector_at
-from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, renormalized, rotation_matrix, unit
+from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, renormalized, rotation_matrix
 from strapdown.kernels.state import store_row, store_several
 
 
@@ -132,7 +132,7 @@ def turn_back(attitude, turn, result):
     """Write the attitudes (n, 4) before the rotations ``turn`` (n, 3)."""
     for i in range(len(turn)):
         q, _ = moved(quaternion_at(attitude, i), (-turn[i, 0], -turn[i, 1], -turn[i, 2]))
-        store_row(result, i, unit(q))
+        store_row(result, i, renormalized(q))
 
 
 class Steps(NamedTuple):

@@ -384,7 +384,7 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
         kernels=machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH, PARAMETERS=True),
         cuts=np.array([*before, *inner, *after]),
         used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
-        lengths=forward.lengths(
+        lengths=forward.divisors(
             record, prepared.events, prepared.model, forward.unit_sigmas(record, prepared.model, {})
         ),
         turning=forward.turns(prepared),
