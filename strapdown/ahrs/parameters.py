@@ -183,7 +183,8 @@ HAND_HELD = AhrsParameters(
     velocity_sigma=0.7,
     acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_scale=12.5,
+    tilt_sigma=0.035,
+    tilt_scale=12.6,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
@@ -196,8 +197,8 @@ HAND_HELD_SMOOTHED = replace(
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
-    tilt_sigma=0.05,
-    tilt_scale=20.0,
+    tilt_sigma=0.045,
+    tilt_scale=20.5,
     heading_scale=2.4,
     gyro_scale_sigma=4e-3,
 )
