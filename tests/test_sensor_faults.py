@@ -13,7 +13,7 @@ from strapdown.ahrs import check_conventions, estimating
 from strapdown.kernels import recording_samples
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_faults
-from strapdown.records.recording import sampled
+from strapdown.records.recording import SENSORS, sampled
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -322,8 +322,20 @@ def test_a_stuck_gyro_is_reported(rows, axes, value, words):
         examined = check_conventions.examine(recording)
         assert said[0] in examined.warnings
         assert examined.verdict == "cannot tell"
-    at_rest = dataclasses.replace(recording, specific_force=np.tile([0.0, 0.0, 9.8], (1000, 1)))
+    at_rest = dataclasses.replace(recording, specific_force=rng.normal([0.0, 0.0, 9.8], 0.01, (1000, 3)))
     assert bool(sensor_faults.stuck_words(at_rest)) == (axes == 1 and words != "")
+
+
+@pytest.mark.parametrize("sensor", ["accelerometer", "magnetometer"])
+def test_a_vector_that_does_not_turn_with_the_unit_is_reported(sensor):
+    turning = swing(10.0)
+    samples = turning.specific_force.copy()
+    samples[400:1000] = samples[400]
+    stuck = dataclasses.replace(turning, **{SENSORS[sensor]: samples})
+    assert sensor_faults.stuck_words(stuck)[0].startswith(f"the {sensor} is stuck at one value from 2 to 4.995 s")
+    assert check_conventions.examine(dataclasses.replace(stuck, true_attitude=None)).verdict == "cannot tell"
+    about_it = 0.1 * samples * np.linspace(1.0, 2.0, len(samples))[:, None]
+    assert not sensor_faults.stuck_words(dataclasses.replace(stuck, rate=about_it))
 
 
 def test_a_coarse_gyro_at_rest_is_not_stuck():

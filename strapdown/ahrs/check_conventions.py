@@ -253,7 +253,7 @@ def examine(recording: Recording) -> Examination:
     else:
         result = _concluded(recording.source, explanations, unit_changes, notes)
         if stuck:
-            result = replace(result, verdict="cannot tell", reason="a gyro axis is stuck; see the warning")
+            result = replace(result, verdict="cannot tell", reason="a sensor is stuck; see the warning")
     if upright and result.verdict == "as declared":
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"

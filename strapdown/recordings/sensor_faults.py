@@ -21,7 +21,7 @@ import numpy as np
 from strapdown.checks import Array, median
 from strapdown.kernels import recording_samples
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import Recording, corrected
+from strapdown.records.recording import SENSORS, Recording, corrected
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
@@ -255,33 +255,51 @@ def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
 
 
 STUCK_TIME = 2.0
-"""Minimum time of equal gyro samples about an axis to be reported while the unit moves, s."""
+"""Minimum time of equal samples to be reported while the unit moves, s."""
 STUCK_SAMPLES = 50
 """Minimum number of them."""
 ROTATES = 0.2
-"""RMS rate about the other axes above which a unit moves, rad/s."""
+"""RMS rate, rad/s, about the other axes of the gyro, or that turns a vector, above which a unit moves."""
 ACCELERATES = 1.0
 """Standard deviation of the specific force above which a unit moves, m/s²."""
 
 
 def stuck_words(recording: Recording) -> list[str]:
-    """Return a warning for each gyro axis stuck at one value, throughout or for seconds in which the other sensors show motion."""
-    time, warnings, runs = recording.time, [], np.empty((3, 2), np.int64)
-    compiled(recording_samples.longest_runs)(read_only(recording.rate), runs)
-    for axis, (first, last) in enumerate(runs.tolist()):
+    """Return a warning for each axis of the gyro and each vector stuck throughout, or for seconds in which other samples show motion."""
+    time, rate, warnings, runs = recording.time, recording.rate, [], np.empty((3, 2), np.int64)
+
+    def stuck(first: int, last: int) -> str:
+        """Return when the samples of a run were equal; empty if it is short."""
         if last - first + 1 < STUCK_SAMPLES or time[last] - time[first] < STUCK_TIME:
+            return ""
+        return "throughout" if last - first == len(time) - 1 else f"from {time[first]:.6g} to {time[last]:.6g} s"
+
+    compiled(recording_samples.longest_runs)(read_only(rate), runs)
+    for axis, (first, last) in enumerate(runs.tolist()):
+        if not (when := stuck(first, last)):
             continue
         span = slice(first, last + 1)
-        others = np.delete(recording.rate[span], axis, axis=1)
-        moves = float(np.sqrt(np.mean(np.sum(others**2, axis=1)))) > ROTATES
+        moves = _rms(np.delete(rate[span], axis, axis=1)) > ROTATES
         if recording.specific_force is not None and np.isfinite(force := recording.specific_force[span]).any():
             moves |= float(np.sqrt(np.sum(np.nanvar(force, axis=0)))) > ACCELERATES
-        whole = last - first == len(time) - 1
-        if not (whole or moves):
+        if moves or when == "throughout":
+            warnings.append(
+                f"the gyro is stuck about {'xyz'[axis]}: {rate[first, axis] / DEGREE:.4g} °/s {when}; the attitude is not tracked then; "
+                "check the sensor"
+            )
+    for sensor in ("accelerometer", "magnetometer"):
+        samples = getattr(recording, SENSORS[sensor])
+        if samples is None:
             continue
-        when = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
-        warnings.append(
-            f"the gyro is stuck about {'xyz'[axis]}: {recording.rate[first, axis] / DEGREE:.4g} °/s {when}; the attitude is not tracked "
-            "then; check the sensor"
-        )
+        compiled(recording_samples.longest_runs)(read_only(samples), runs)
+        first, last = int(runs[:, 0].max()), int(runs[:, 1].min())
+        vector = samples[first]
+        # Perpendicular to it: a rotation about a vector does not change it.
+        if (when := stuck(first, last)) and _rms(np.cross(rate[first : last + 1], vector)) > ROTATES * _rms(vector):
+            warnings.append(f"the {sensor} is stuck at one value {when}, while the gyro turns it; check the sensor")
     return warnings
+
+
+def _rms(vectors: Array) -> float:
+    """Return the root mean square magnitude of vectors (..., k)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
