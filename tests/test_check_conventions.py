@@ -71,6 +71,8 @@ def broken(recording: Recording, seed: int) -> dict[str, tuple[Recording, str]]:
         "gyro sign": (replace(recording, rate=-w), "axes of the gyro are inverted"),
         "gyro too large": (replace(recording, rate=w * 180.0 / np.pi), "57.3 times too large"),
         "gyro too small": (replace(recording, rate=w * np.pi / 180.0), "57.3 times too small"),
+        "force in mg": (replace(recording, specific_force=f * 1e3 / 9.80665), "102 times too large (mg read as m/s²"),
+        "force in mm/s²": (replace(recording, specific_force=f * 1e3), "1000 times too large (mm/s² read as m/s²"),
         "force in g": (replace(recording, specific_force=f / 9.80665), "9.81 times too small"),
         "force twice": (replace(recording, specific_force=f * 9.80665), "9.81 times too large"),
         "force axes": (replace(recording, specific_force=f @ force.T), f"axes of the accelerometer {read_as(force)}"),
@@ -247,6 +249,13 @@ def test_rates_beyond_any_gyro_are_doubted():
     rate[700, 1] = -1.5e3
     (doubt,) = check_conventions.examine(replace(recording, rate=rate)).doubts
     assert "8.59e+04 °/s at 7 s, and 0.02% of its samples exceed" in doubt
+
+
+@pytest.mark.parametrize("reference", [True, False])
+def test_a_slow_gyro_in_mrad_per_s_is_named(reference):
+    slow = simulated(9, amplitude=0.3, reference=reference)
+    examination = check_conventions.examine(replace(slow, rate=1e3 * slow.rate))
+    assert examination.reason.startswith("gyro rates are 1000 times too large (mrad/s read as rad/s")
 
 
 def test_all_axes_are_signed_permutations_the_identity_first():

@@ -116,7 +116,7 @@ BARE = "time,gx,gy,gz,ax [m/s2],ay,az"
 SECOND = "0.01,0.4,0.5,0.6,3,4,8"
 REFUSED = {
     "undeclared gyro": (BARE, ROWS, "does not declare the unit of its gyro", "gx [rad/s]", "rad/s, deg/s, mrad/s, mdeg/s"),
-    "undeclared force": ("time,gx [rad/s],gy,gz,ax,ay,az", ROWS, "unit of its accelerometer", "ax [m/s2]", "(m/s2, g, mg)"),
+    "undeclared force": ("time,gx [rad/s],gy,gz,ax,ay,az", ROWS, "unit of its accelerometer", "ax [m/s2]", "(m/s2, g, mg, mm/s2)"),
     "unknown gyro unit": (HEADER.replace("rad/s", "deg/sec"), ROWS, "unit of the gyro 'deg/sec'", "did you mean 'deg/s'"),
     "unknown force unit": (HEADER.replace("m/s2", "ft/s2"), ROWS, "unit of the accelerometer 'ft/s2' is not known"),
     "two units": ("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az", ROWS, "column gy is in deg/s", "rad/s", "same unit"),

@@ -75,11 +75,14 @@ GYRO_UNITS: dict[str, float] = {
     "": 1.0,
     _unit("gyro rates are 57.3 times too large", "deg/s read as rad/s", "gyro", "deg/s"): math.pi / 180.0,
     _unit("gyro rates are 57.3 times too small", "rad/s read as deg/s", "gyro", "rad/s"): 180.0 / math.pi,
+    _unit("gyro rates are 1000 times too large", "mrad/s read as rad/s, or mdeg/s as deg/s", "gyro", "mrad/s"): 1e-3,
 }
 FORCE_UNITS: dict[str, float] = {
     "": 1.0,
     _unit("specific force is 9.81 times too small", "g read as m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
     _unit("specific force is 9.81 times too large", "m/s² read as g", "accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
+    _unit("specific force is 102 times too large", "mg read as m/s²", "accelerometer", "mg"): 1e-3 * STANDARD_GRAVITY,
+    _unit("specific force is 1000 times too large", "mm/s² read as m/s², or mg as g", "accelerometer", "mm/s2"): 1e-3,
 }
 
 NO_CHANGE = "no change"
@@ -586,7 +589,7 @@ def _turns_between(recording: Recording, first: np.ndarray, last: np.ndarray) ->
 
 
 def _gyro_fits(turn: Array, reference: Array) -> Array:
-    """Return misfits (readings, 48 · 3) of ``reference = unit · axes · turn``, by axes and unit."""
+    """Return misfits (readings, 48 · units) of ``reference = unit · axes · turn``, by axes and unit."""
     cross = np.swapaxes(reference, -1, -2) @ turn
     own, other = np.sum(turn**2), np.sum(reference**2, axis=(1, 2))
     factor = np.array(list(GYRO_UNITS.values()))

@@ -29,7 +29,7 @@ class Samples:
     """Layout of the recording."""
 
     gyro_unit: str | None = Option(None, help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")
-    accelerometer_unit: str | None = Option(None, help="Table: unit of the accelerometer, m/s2, g or mg.")
+    accelerometer_unit: str | None = Option(None, help="Table: unit of the accelerometer, m/s2, mm/s2, g or mg.")
     magnetometer_unit: str | None = Option(None, help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
     time_unit: str | None = Option(None, help="Table: unit of the time, s, ms, us or ns.")
     columns: str | None = Option(

@@ -17,7 +17,7 @@ from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE, "mrad/s": 1e-3, "mdeg/s": 1e-3 * DEGREE}
 """Units of a gyro column, and their factor to rad/s."""
-FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
+FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY, "mm/s2": 1e-3}
 """Units of an accelerometer column, and their factor to m/s²."""
 MAGNETIC_UNITS = {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4, "mG": 1e-7}
 """Units of a magnetometer column, and their factor to T."""
@@ -107,7 +107,7 @@ class Recording(Listed):
             row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(self.rate)), self.rate.shape))
             raise InputError(
                 f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
-                "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
+                "rad/s or deg/s by the scale factor of the datasheet, declare another unit (mrad/s), or remove the row"
             )
         for sensor in ("accelerometer", "magnetometer", "reference"):
             name = FIELDS[sensor]
