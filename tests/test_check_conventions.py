@@ -242,6 +242,17 @@ def test_a_force_in_no_unit_is_noted():
     assert any("fits neither" in doubt for doubt in examination.doubts)
 
 
+def test_an_acceleration_without_gravity_is_named():
+    whole = simulated(9)
+    gravity = quaternion.rotate(quaternion.conjugate(whole.true_attitude), [0.0, 0.0, STANDARD_GRAVITY])
+    linear = replace(whole, specific_force=whole.specific_force - gravity, true_attitude=None)
+    for recording in (linear, replace(linear, magnetic_field=None)):
+        examination = check_conventions.examine(recording)
+        assert examination.verdict == "cannot tell"
+        assert "is not gravity" in " ".join(examination.warnings)
+        assert "axes" not in " ".join(examination.warnings)
+
+
 def test_rates_beyond_any_gyro_are_doubted():
     recording = simulated(9)
     assert check_conventions.examine(recording).doubts == ()
