@@ -299,6 +299,13 @@ def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     np.testing.assert_allclose(np.diff(growth), 1e-6 * np.diff(recording.time), rtol=1e-6)
 
 
+def test_a_row_for_each_sensor_is_one_recording(csv):
+    rows = [f"{0.01 * k:.2f},{k},0,0,,,\n{0.01 * k + 0.004:.3f},,,,{k},2,9" for k in range(4)]
+    recording = read(csv(rows=rows))
+    np.testing.assert_array_equal(recording.rate[:, 0], range(4))
+    np.testing.assert_array_equal(recording.specific_force, [[k, 2, 9] for k in range(4)])
+
+
 def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     """A logger that writes a row twice; the same stamp with another sample is refused, and named."""
     rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(6)]

@@ -45,8 +45,8 @@ def read_csv(
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
-    left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
-    :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
+    left out and listed in ``missing_gyro``, their other samples moved to the nearest row; rows that repeat the row before are left out and
+    listed in ``repeated``. Options as for :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     table = Table(file)
     header, load, clock_ns = table.header, table.load, table.clock_ns

@@ -74,8 +74,8 @@ class Recording(Listed):
     epoch_ns : int, default 0
         Reading of the source's clock at time 0, ns; nanoseconds since 1970 for a clock that counts from then.
     missing_gyro : ndarray (k,), default empty
-        Stamps of rows without a gyro sample, s. These rows are left out: the intervals on both sides are joined, the rotation is
-        computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
+        Stamps of rows without a gyro sample, s. These rows are left out (:func:`with_gyro`): the intervals on both sides are joined, the
+        rotation is computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
     repeated : ndarray (k,), default empty
         Stamps of rows that repeat the stamp of the row before, s; they are left out. If their share is above :data:`FEW_REPEATED` and
         their samples differ, the file is rejected.
@@ -213,8 +213,8 @@ class Recording(Listed):
         words = []
         if len(self.missing_gyro):
             words.append(
-                f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out: the "
-                "rotation across them comes from the samples before and after."
+                f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out, "
+                "and other samples in them moved to the nearest row: the rotation across them comes from the samples before and after."
             )
         if len(self.repeated):
             words.append(
@@ -224,7 +224,10 @@ class Recording(Listed):
 
 
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
-    """Return a recording of the rows that have a gyro sample and do not repeat the row before, with the stamps of the other rows."""
+    """Return a recording of the rows that have a gyro sample and do not repeat the row before, with the stamps of the other rows.
+
+    A log may have a row for each sensor: samples of vectors in rows without the gyro's go to the nearest row with one that lacks them.
+    """
     same = np.diff(time) == 0.0
     if same.any() and np.mean(same) >= FEW_REPEATED:
         for column in (rate, *columns.values()):
@@ -242,7 +245,14 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                 f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
             )
         stamps = increasing(f"{source}: time", columns["time"])
-        columns = _rows(columns, known) | {"missing_gyro": stamps[~known]}
+        moved = {
+            name: at_nearest(stamps[known], stamps[there], columns[name][there])[0]
+            for name in ("specific_force", "magnetic_field")
+            if name in columns
+            and np.shape(columns[name])[:1] == known.shape
+            and len(there := np.flatnonzero(~np.isnan(columns[name]).any(axis=1)))
+        }
+        columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known]}
     return Recording(source=source, **columns)
 
 
