@@ -142,12 +142,26 @@ def test_of_several_units_one_must_be_chosen(bag):
     np.testing.assert_array_equal(right.rate, other[:, :3])
     assert right.magnetic_field[3, 0] == 1e-5 + 3
     assert len(read(path, topic="/left/imu").time) == 40
+    of_one = bag("mcap", first + second + field, name="of_one")
+    assert read(of_one, topic="/left/imu").magnetic_field is None
+    assert "None of /right/mag was read" in read(of_one, topic="/left/imu").remarks[1]
 
 
 def test_a_unit_without_an_accelerometer_has_none(bag):
     _, content = imu()
     content = [(t, k, s, f, np.r_[v[:3], 0, 0, 0]) for t, k, s, f, v in content]
     assert read(bag("mcap", content)).specific_force is None
+
+
+def test_a_wrong_unit_of_a_bag_is_corrected_in_its_csv(bag, tmp_path):
+    values, content = imu()
+    path = bag("mcap", content)
+    with pytest.raises(InputError, match=r"header of its CSV \(`strapdown convert`\), or drop the option for gyro"):
+        read(path, units={"gyro": "deg/s"})
+    table = tmp_path / "walk.csv"
+    recordings.write(read(path), table)
+    table.write_text(table.read_text().replace("[rad/s]", "[deg/s]"))
+    np.testing.assert_allclose(read(table).rate, np.radians(values[:, :3]), rtol=1e-15)
 
 
 def test_headers_without_stamps_and_stamps_out_of_order_are_said(bag):

@@ -163,9 +163,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 
 
 _REASONS = {
-    "units": "its layout defines its units",
-    "columns": "columns are for a table (CSV, Parquet)",
-    "topic": "a topic is for a bag or a flight log",
+    "units": "its layout defines its units; correct them in the header of its CSV (`strapdown convert`), or",
+    "columns": "columns are for a table (CSV, Parquet);",
+    "topic": "a topic is for a bag or a flight log;",
 }
 """Why a format has no such option of :func:`read`."""
 
@@ -191,7 +191,7 @@ def read(
     for name, reason in _REASONS.items():
         if options[name] and name not in file_format.options:
             which = f" for {', '.join(units)}" if units and name == "units" else ""
-            raise InputError(f"{file.name} ({file_format.name}): {reason}; drop the option{which}")
+            raise InputError(f"{file.name} ({file_format.name}): {reason} drop the option{which}")
     options = {name: value for name, value in options.items() if name in file_format.options}
     with reading.from_file(file, file_format.name):
         recording: Recording = file_format.read(file, **options)

@@ -136,8 +136,9 @@ def read_bag(file: Path, *, topic: str) -> Recording:
         )
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
+    units = [t.name for t in topics.values() if t.kind == IMU]
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(topic_name, [t for t in topics.values() if t.kind == kind and len(t)])
+        other = _beside(topic_name, [t for t in topics.values() if t.kind == kind and len(t)], units)
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
@@ -171,14 +172,13 @@ def topic_of(name: str, topics: Mapping[str, Topic], topic: str, what: str, kind
     return first
 
 
-def _beside(unit: str, candidates: list[Topic]) -> Topic | str | None:
-    """Return the topic of a kind that belongs to an inertial unit: the only one, or the only one of its namespace; else a remark."""
-    if len(candidates) <= 1:
-        return candidates[0] if candidates else None
-    space = unit.rpartition("/")[0] + "/"
-    near = [t for t in candidates if t.name.startswith(space)]
-    if len(near) == 1:
-        return near[0]
+def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str | None:
+    """Return the topic of a kind that belongs to one of the inertial units: the only one of its namespace or, failing that, of none's."""
+    within = lambda t, name: "/" in name[1:] and t.name.startswith(name.rpartition("/")[0] + "/")  # noqa: E731
+    own = [t for t in candidates if within(t, unit)]
+    near = own or [t for t in candidates if not any(within(t, other) for other in units)]
+    if len(near) == 1 or not candidates:
+        return near[0] if near else None
     names = ", ".join(t.name for t in candidates)
     return f"None of {names} was read, because it is ambiguous which of them belongs to {unit}."
 
