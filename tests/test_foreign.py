@@ -209,6 +209,8 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
         [finding["value"] for finding in saved["findings"]], [finding.value for finding in own.findings], rtol=1e-9
     )
     assert saved["alignment"]["removed"] == []
+    python = consistency.check_attitudes(*map(read_attitudes, (files / name, files / "record.h5"))).judgement
+    assert json.loads(json.dumps(python.summary())) == {key: saved[key] for key in python.summary()}
     assert "the file declares that its covariance is of the body error" in said
 
 

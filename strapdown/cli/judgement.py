@@ -85,8 +85,6 @@ def check(
 def _judged_foreign(result: Path, topic: str, options: _Foreign, how: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
     own = sd.read_attitudes(result, topic=topic)
-    if reading.kind(result) == "strapdown estimate":
-        own = replace(own, innovations=sd.read(result).innovations)  # type: ignore[union-attr]
     truth = None if options.truth is None else sd.read_attitudes(options.truth)
     how |= {"error_frame": options.error_frame, "align": options.align}
     checked = sd.consistency.check_attitudes(own, truth, **how)

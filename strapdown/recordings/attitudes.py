@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, array
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
-from strapdown.records import Innovations, outputs
+from strapdown.records import Innovations, outputs, result_files
 from strapdown.records.estimate import STATES
 from strapdown.records.recording import TIME_UNITS, whole_ns
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -170,6 +170,7 @@ def _own(path: Path, kind: str) -> Attitudes:
                 variance = reading.numbers(file, "variance")
                 P = variance[:, :, None] * np.eye(variance.shape[1])
             bias = reading.numbers(file, "bias") if "bias" in file else None
+            innovations = result_files.innovations(file)
             attributes = reading.attributes(file)
         return Attitudes(
             source=path.name,
@@ -178,6 +179,7 @@ def _own(path: Path, kind: str) -> Attitudes:
             covariance=P,
             error_frame="" if P is None else "body",
             bias=bias,
+            innovations={k: replace(series, time=series.time - arrays["time"][0]) for k, series in innovations.items()},
             motion=str(attributes.get("motion", "")),
         )
     if kind == recordfiles.KIND:

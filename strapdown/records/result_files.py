@@ -7,9 +7,12 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 import strapdown
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, array
 from strapdown.files import atomic_write, reading, set_attributes, whole_hdf5
+from strapdown.records.estimate import Innovations
 
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
@@ -51,3 +54,46 @@ def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not str(attributes.get("kind", "")).startswith("strapdown "):
         raise InputError(f"{path} is not a result of strapdown; pass a file written by one of its commands")
     return attributes
+
+
+def numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
+    """Return an array of a file, checked by :func:`strapdown.checks.array`."""
+    return array(reading.place(group, name), reading.numbers(group, name), shape)
+
+
+def each(place: str, value: Array, good: Any, remedy: str) -> Array:
+    """Return values, checked entry by entry; the error names the first that is not good."""
+    if not np.all(good):
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise InputError(f"{place}{list(index)} is {value[index]:g}{remedy}")
+    return value
+
+
+def above_zero(place: str, variance: Array) -> Array:
+    """Return variances, checked to be positive."""
+    remedy = (
+        ", and a variance must be greater than zero; the file is damaged, or a sensor had no noise: give each a sigma above zero and "
+        "repeat the estimate"
+    )
+    return each(place, variance, variance > 0.0, remedy)
+
+
+def parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:
+    """Return the subgroups of a group, each with its attributes; empty if there is no such group."""
+    return [(reading.attributes(part), part) for part in file[name].values()] if name in file else []
+
+
+def innovations(file: Any) -> dict[str, Innovations]:
+    """Return the innovations of an estimate's file by sensor."""
+    return {str(own["sensor"]): _innovations(part) for own, part in parts(file, "innovations")}
+
+
+def _innovations(part: Any) -> Innovations:
+    number = len(numbers(part, "time", ("m",)))
+    innovation = numbers(part, "innovation", (number, "degrees of freedom"))
+    return Innovations(
+        time=numbers(part, "time", (number,)),
+        innovation=innovation,
+        variance=above_zero(reading.place(part, "variance"), numbers(part, "variance", innovation.shape)),
+        weight=numbers(part, "weight", (number,)) if "weight" in part else None,
+    )

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, array, count, finite, increasing, one_of, unit_quaternions
+from strapdown.checks import Array, InputError, count, finite, increasing, one_of, unit_quaternions
 from strapdown.estimation.setup.files import from_toml, to_toml
 from strapdown.files import reading, set_attributes
 from strapdown.recordings.recordfiles import origin_attributes, origin_of
 from strapdown.records import ErrorStateEstimate, Estimate, Event, Innovations, Truth, put, result_file
 from strapdown.records.estimate import EVENT_KINDS
+from strapdown.records.result_files import above_zero, each, innovations, numbers, parts
 
 KIND = "strapdown estimate"
 """The attribute ``kind`` of an estimate's file."""
@@ -108,7 +109,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             raise InputError(
                 f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
             )
-        time = increasing(reading.place(file, "time"), _numbers(file, "time", ("n",)))
+        time = increasing(reading.place(file, "time"), numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
         variance, covariance = _variances(file, rows)
@@ -118,12 +119,12 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             bias=_biases(file, "bias", rows) if "bias" in file else np.full((rows, 3), np.nan),
             variance=variance,
             covariance=covariance,
-            whole_covariance=_numbers(file, "whole_covariance", (rows, "n", "n"))
+            whole_covariance=numbers(file, "whole_covariance", (rows, "n", "n"))
             if "whole_covariance" in file
             else None,
-            innovations={str(own["sensor"]): _innovations(part) for own, part in _parts(file, "innovations")},
+            innovations=innovations(file),
             skipped={
-                str(own["sensor"]): count("skipped", own["number"], minimum=0) for own, _ in _parts(file, "skipped")
+                str(own["sensor"]): count("skipped", own["number"], minimum=0) for own, _ in parts(file, "skipped")
             },
             events=tuple(
                 Event(
@@ -131,9 +132,9 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                     sensor=str(own["sensor"]),
                     **{name: finite(f"{name} of an event", own[name]) for name in ("start", "end", "value")},
                 )
-                for own, _ in _parts(file, "events")
+                for own, _ in parts(file, "events")
             ),
-            error_states={str(own["name"]): _states(own, part, rows) for own, part in _parts(file, "states")},
+            error_states={str(own["name"]): _states(own, part, rows) for own, part in parts(file, "states")},
             truth=_truth(file, rows) if "truth" in file else None,
             setup=from_toml(str(attributes["filter"]), f"{path}: filter") if "filter" in attributes else None,
             origin=origin_of(attributes, path),
@@ -151,50 +152,28 @@ def _variances(file: Any, rows: int) -> tuple[Array, Array | None]:
     without = (0, 6 - size)
     if not ("variance" in file or "covariance" in file):  # of an integrated attitude
         return np.full((rows, 6), np.nan), np.broadcast_to(np.nan, (rows, 6, 6))
-    variance = _above_zero(reading.place(file, "variance"), _numbers(file, "variance", (rows, size)))
+    variance = above_zero(reading.place(file, "variance"), numbers(file, "variance", (rows, size)))
     variance = np.pad(variance, ((0, 0), without), constant_values=np.nan)
     if "covariance" not in file:
         return variance, None
-    covariance = _numbers(file, "covariance", (rows, size, size))
-    _above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
+    covariance = numbers(file, "covariance", (rows, size, size))
+    above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
     return variance, np.pad(covariance, ((0, 0), without, without), constant_values=np.nan)
-
-
-def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
-    """Return an array of a file, checked by :func:`strapdown.checks.array`."""
-    return array(reading.place(group, name), reading.numbers(group, name), shape)
-
-
-def _need(place: str, value: Array, good: Any, remedy: str) -> Array:
-    """Return values, checked entry by entry; the error names the first that is not good."""
-    if not np.all(good):
-        index = tuple(int(i) for i in np.argwhere(~good)[0])
-        raise InputError(f"{place}{list(index)} is {value[index]:g}{remedy}")
-    return value
-
-
-def _above_zero(place: str, variance: Array) -> Array:
-    """Return variances, checked to be positive."""
-    remedy = (
-        ", and a variance must be greater than zero; the file is damaged, or a sensor had no noise: give each a sigma above zero and "
-        "repeat the estimate"
-    )
-    return _need(place, variance, variance > 0.0, remedy)
 
 
 def _biases(group: Any, name: str, rows: int) -> Array:
     """Return gyro biases (rows, 3), checked not to exceed :data:`LARGEST_BIAS`."""
-    value = _numbers(group, name, (rows, 3))
+    value = numbers(group, name, (rows, 3))
     remedy = (
         " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
         "the gyro's unit"
     )
-    return _need(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
+    return each(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:
     """Return attitudes (rows, 4) unchanged, checked to be of unit norm."""
-    value = _numbers(group, name, (rows, 4))
+    value = numbers(group, name, (rows, 4))
     unit_quaternions(reading.place(group, name), value)
     return value
 
@@ -203,7 +182,7 @@ def _truth(file: Any, rows: int) -> Truth:
     """Return the truth at the rows of an estimate, NaN where there is none."""
     row = np.arange(rows)
     if "truth/row" in file:
-        row = _numbers(file, "truth/row", ("m",)).astype(np.intp)
+        row = numbers(file, "truth/row", ("m",)).astype(np.intp)
         if np.any(np.diff(row, prepend=-1) <= 0) or np.any(row >= rows):
             raise InputError(
                 f"{reading.place(file, 'truth/row')} are not increasing rows of the estimate; the file is damaged"
@@ -211,30 +190,13 @@ def _truth(file: Any, rows: int) -> Truth:
     attitude = np.full((rows, 4), np.nan)
     attitude[row] = _attitudes(file, "truth/attitude", len(row))
     bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
-    movement = _numbers(file, "truth/movement", (rows,)) > 0.0 if "truth/movement" in file else None
+    movement = numbers(file, "truth/movement", (rows,)) > 0.0 if "truth/movement" in file else None
     return Truth(attitude=attitude, bias=bias, movement=movement)
-
-
-def _parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:
-    """Return the subgroups of a group, each with its attributes; empty if there is no such group."""
-    return [(reading.attributes(part), part) for part in file[name].values()] if name in file else []
-
-
-def _innovations(part: Any) -> Innovations:
-    """Return the innovations of one sensor's group."""
-    number = len(_numbers(part, "time", ("m",)))
-    innovation = _numbers(part, "innovation", (number, "degrees of freedom"))
-    return Innovations(
-        time=_numbers(part, "time", (number,)),
-        innovation=innovation,
-        variance=_above_zero(reading.place(part, "variance"), _numbers(part, "variance", innovation.shape)),
-        weight=_numbers(part, "weight", (number,)) if "weight" in part else None,
-    )
 
 
 def _states(attributes: dict[str, Any], part: Any, rows: int) -> ErrorStateEstimate:
     """Return the estimate of one group of error states."""
-    values = _numbers(part, "values", (rows, len(attributes["components"])))
+    values = numbers(part, "values", (rows, len(attributes["components"])))
     if len(attributes["units"]) != len(attributes["components"]):
         raise InputError(
             f"{reading.place(part, 'units')} and components differ in number; the file is damaged, make it again"
@@ -243,5 +205,5 @@ def _states(attributes: dict[str, Any], part: Any, rows: int) -> ErrorStateEstim
         components=tuple(map(str, attributes["components"])),
         units=tuple(map(str, attributes["units"])),
         values=values,
-        variance=_above_zero(reading.place(part, "variance"), _numbers(part, "variance", values.shape)),
+        variance=above_zero(reading.place(part, "variance"), numbers(part, "variance", values.shape)),
     )
