@@ -157,6 +157,11 @@ def test_arguments_of_another_class_are_refused_by_name(name, value):
         LiveAhrs(interval=0.01, **{name: value})
 
 
+def test_a_rate_is_no_interval():
+    with pytest.raises(InputError, match=r"interval is 100 s; give that between two samples"):
+        LiveAhrs(interval=100)
+
+
 def test_samples_far_faster_than_declared_are_refused():
     live = LiveAhrs(interval=0.01)
     for k in range(14):

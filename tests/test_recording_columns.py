@@ -165,7 +165,14 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
 
 @pytest.mark.parametrize(
     "name",
-    ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std", "angular_acceleration_{}"],
+    [
+        "Linear Acceleration {} (m/s^2)",
+        "LinAcc{} (g)",
+        "userAcceleration{}",
+        "gyro_bias_{}",
+        "acc_{}_std",
+        "angular_acceleration_{}",
+    ],
 )
 def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
     """An acceleration without gravity shows no vertical."""

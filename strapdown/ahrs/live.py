@@ -80,6 +80,10 @@ class LiveAhrs:
         latency: float | None = None,
     ) -> None:
         self.interval = positive("interval", interval, unit="s")
+        if self.interval > starting.QUIET_SPAN:
+            raise InputError(
+                f"interval is {interval:g} s; give that between two samples, at most 1 s (0.01 for 100 Hz)"
+            )
         instance("magnetometer", magnetometer, bool, "give True or False")
         if parameters is not None:
             instance("parameters", parameters, AhrsParameters, 'such as ahrs.of_motion("vehicle", magnetometer=True)')

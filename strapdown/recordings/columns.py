@@ -72,7 +72,7 @@ _WORDS = {
     "accelerometer": {"acc", "accel", "accl", "accelerometer", "acceleration", "a", "specific"},
     "magnetometer": {"mag", "magn", "magnet", "magnetometer", "magnetic", "m", "compass", "magneticfield"},
 }
-_OTHER = {"linear", "user", "gravity", "free", "world", "earth", "global", "nav", "bias", "std", "sigma", "cov"}
+_OTHER = {"linear", "lin", "user", "gravity", "free", "world", "earth", "global", "nav", "bias", "std", "sigma", "cov"}
 _OTHER |= {"covariance", "var", "variance", "offset", "delta", "filtered", "temperature", "temp"}
 """Words in names of columns that are not samples of a sensor."""
 _TIMES = ("time", "timestamp", "timestamps", "t", "stamp", "ts", "seconds elapsed")
