@@ -232,7 +232,7 @@ def test_missing_rows_are_left_out():
 
 def test_a_gyro_alone_is_refused():
     bare = replace(simulated(0, duration=2.0, reference=False), specific_force=None, magnetic_field=None)
-    with pytest.raises(InputError, match="has only a gyro"):
+    with pytest.raises(InputError, match=r"has only a gyro; .* name its columns, as in `columns={'ax': 'NAME'}`"):
         check_conventions.examine(bare)
 
 

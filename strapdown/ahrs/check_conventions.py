@@ -231,7 +231,8 @@ def examine(recording: Recording) -> Examination:
     """
     if all(value is None for value in (recording.true_attitude, recording.specific_force, recording.magnetic_field)):
         raise InputError(
-            f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
+            f"{recording.source} has only a gyro; a reference attitude, an accelerometer (with gravity) or a magnetometer is needed too; "
+            f"if the file has one, name its columns, as in {Hint('columns', {'ax': 'NAME'})}"
         )
     step = max(1, round(MIN_INTERVAL / recording.interval))
     sensors = {
