@@ -158,7 +158,7 @@ def test_arguments_of_another_class_are_refused_by_name(name, value):
 
 
 def test_a_rate_is_no_interval():
-    with pytest.raises(InputError, match=r"interval is 100 s; give that between two samples"):
+    with pytest.raises(InputError, match=r"interval is 100 s; give that of the samples"):
         LiveAhrs(interval=100)
 
 

@@ -156,7 +156,9 @@ def test_a_unit_without_an_accelerometer_has_none(bag):
 def test_a_wrong_unit_of_a_bag_is_corrected_in_its_csv(bag, tmp_path):
     values, content = imu()
     path = bag("mcap", content)
-    with pytest.raises(InputError, match=r"header of its CSV \(`strapdown convert`\), or drop the option for gyro"):
+    with pytest.raises(
+        InputError, match=r"header of its CSV \(`strapdown convert`\), or leave `units={'gyro': 'deg/s'}` out"
+    ):
         read(path, units={"gyro": "deg/s"})
     table = tmp_path / "walk.csv"
     recordings.write(read(path), table)

@@ -245,15 +245,12 @@ def examine(recording: Recording) -> Examination:
     doubts += _too_fast(recording) + stuck
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
-    explanations = (_without_reference if recording.true_attitude is None else _with_reference)(
-        recording, sensors, step
-    )
-    notes = _unseen(recording)
+    explained = _without_reference if recording.true_attitude is None else _with_reference
+    explanations = explained(recording, sensors, step)
+    notes = tuple(_unseen(recording))
     if explanations is None:
         reason = "the recording has hardly any rotation, or too few samples"
-        result = Examination(
-            source=recording.source, verdict="cannot tell", reason=reason, candidates=(), notes=tuple(notes)
-        )
+        result = Examination(source=recording.source, verdict="cannot tell", reason=reason, candidates=(), notes=notes)
     else:
         result = _concluded(recording.source, explanations, unit_changes, notes)
         if stuck:
@@ -262,9 +259,7 @@ def examine(recording: Recording) -> Examination:
             result = replace(result, verdict="cannot tell", reason="the accelerometer does not show gravity")
             unsaid = []
     if upright and result.verdict == "as declared":
-        result = replace(
-            result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
-        )
+        result = replace(result, verdict="cannot tell", reason="the sensors agree; see the warning on their sign")
     return replace(result, doubts=tuple(upright + (unsaid if result.verdict == "cannot tell" else []) + doubts))
 
 
@@ -281,7 +276,7 @@ class _Explanations(NamedTuple):
     """m₀ of each relation."""
 
 
-def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], notes: list[str]) -> Examination:
+def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], notes: tuple[str, ...]) -> Examination:
     fit = np.sum([_score(values, explanations.floors[name]) for name, values in explanations.misfit.items()], axis=0)
     score = fit - PENALTY * explanations.number
     order = np.argsort(-score, kind="stable")
@@ -310,8 +305,8 @@ def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], 
         reason = words or "no change explains the recording better than its declared conventions"
     if equal and verdict != "cannot tell":
         others = ("; ".join((*explanations.changes(k), *sure)) or NO_CHANGE for k in equal)
-        notes = [*notes, "fits as well: " + " / ".join(others)]
-    return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(best), notes=tuple(notes))
+        notes = (*notes, "fits as well: " + " / ".join(others))
+    return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(best), notes=notes)
 
 
 REST_SPREAD = 0.05
@@ -336,9 +331,8 @@ def at_rest(recording: Recording) -> list[str]:
     upward, reading, dip = resting
     reads = f"at rest the accelerometer reads {reading:.3g} m/s² along z"
     if dip is not None and dip < -MIN_DIP:
-        field = (
-            f"the field points {-dip / DEGREE:.0f}° upward by the accelerometer, as south of the magnetic equator only"
-        )
+        upward_by = f"{-dip / DEGREE:.0f}° upward by the accelerometer"
+        field = f"the field points {upward_by}, as south of the magnetic equator only"
         if upward > DOWN:
             return [f"{field}; elsewhere the magnetometer is inverted ({Hint('invert', 'magnetometer')})"]
         return [
@@ -405,7 +399,7 @@ def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
     return ((words,) if words else ()), []
 
 
-LEAST_GRAVITY = 0.6
+MIN_GRAVITY = 0.6
 """Minimum mean specific force over a window, relative to gravity; in 94 recordings it was .72 or more, without gravity mostly below .6."""
 
 
@@ -415,9 +409,8 @@ def _without_gravity(best: Candidate, force: _Sensor | None) -> list[str]:
     if force is None or misfit is None:
         return []
     mean = (1.0 - misfit) * force.strength
-    if mean >= LEAST_GRAVITY * _gravity(force.strength)[1]:
-        return []
-    return [
+    weak = mean < MIN_GRAVITY * _gravity(force.strength)[1]
+    return weak * [
         f"the specific force averages {mean:.2g} m/s² over {SPAN:g} s, which is not gravity; use the acceleration with gravity, not the "
         "“linear” or “user” acceleration"
     ]

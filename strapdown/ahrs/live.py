@@ -81,9 +81,7 @@ class LiveAhrs:
     ) -> None:
         self.interval = positive("interval", interval, unit="s")
         if self.interval > starting.QUIET_SPAN:
-            raise InputError(
-                f"interval is {interval:g} s; give that between two samples, at most 1 s (0.01 for 100 Hz)"
-            )
+            raise InputError(f"interval is {interval:g} s; give that of the samples, at most 1 s: 0.01 for 100 Hz")
         instance("magnetometer", magnetometer, bool, "give True or False")
         if parameters is not None:
             instance("parameters", parameters, AhrsParameters, 'such as ahrs.of_motion("vehicle", magnetometer=True)')
@@ -255,9 +253,8 @@ class LiveAhrs:
             else:
                 call[7], call[8], call[9] = field.tolist() if type(field) is np.ndarray else field
         except (TypeError, ValueError, OverflowError):
-            raise InputError(
-                f"{name} is {sample!r}; give {'one number' if name == 'time' else 'three numbers'}"
-            ) from None
+            wanted = "one number" if name == "time" else "three numbers"
+            raise InputError(f"{name} is {sample!r}; give {wanted}") from None
         if self._imu.arrays.count[0] == 0:
             self._begin()
             return

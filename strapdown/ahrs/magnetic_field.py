@@ -88,9 +88,7 @@ class MagneticField:
         try:
             from pygeomag import GeoMag, decimal_year_from_date
         except ImportError:
-            raise InputError(
-                "the field at a place needs the package pygeomag; run pip install 'strapdown[wmm]'"
-            ) from None
+            raise InputError("the field at a place needs pygeomag; run pip install 'strapdown[wmm]'") from None
         year = 5 * (day.year // 5)  # a model holds for five years
         model = GeoMag(coefficients_file=f"wmm/WMM_{'2015v2' if year == 2015 else year}.COF")
         try:

@@ -112,9 +112,7 @@ def first_vector(samples: Array | None, turned: Array, source: str, sensor: str)
             break
     else:
         state = "is zero and gives no direction" if np.isfinite(size).any() else "has no valid sample"
-        raise InputError(
-            f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
-        )
+        raise InputError(f"{source}: the {sensor} {state}; cut the recording to where it has, or leave its columns out")
     k = int(np.argmax(valid))
     return np.asarray(quaternion.rotate(turned[k], samples[k]))
 

@@ -89,9 +89,7 @@ def calibrate(
         instance("recordings", recording, Recording, "give recordings, as read returns them")
     units = {recording.magnetic_unit for recording in used}
     if len(units) > 1:
-        raise InputError(
-            f"the units of the recordings' fields are {', '.join(map(repr, units))}; declare one unit for all"
-        )
+        raise InputError(f"the units of the fields are {', '.join(map(repr, units))}; declare one unit for all")
     intervals = gathered(used)
     if len(intervals.node) < 4 * 10:
         raise InputError(

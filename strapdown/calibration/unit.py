@@ -286,9 +286,7 @@ def _from_table(table: Mapping[str, Any], place: str) -> UnitCalibration:
     form = {**FORM, "source": tables.TEXT, "magnetic_unit": tables.TEXT}
     unit = values.get("magnetic_unit", "")
     if unit and unit not in MAGNETIC_UNITS:
-        raise InputError(
-            f"{place}: magnetic_unit is {unit!r}; give one of {', '.join(MAGNETIC_UNITS)}, or leave it out"
-        )
+        raise InputError(f"{place}: magnetic_unit is {unit!r}; give one of {', '.join(MAGNETIC_UNITS)} or leave it out")
     errors: SensorErrors = tables.build(SensorErrors, sigma, FORM, f"{place}.sigma")
     negative = [name for name, _, value in errors.entries() if value < 0.0]
     if negative:

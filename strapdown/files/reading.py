@@ -248,9 +248,7 @@ _DOTTED = re.compile(rf"(?<![\w-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DOTTED_KEYS}}}")
 def from_toml(content: str, place: str) -> dict[str, Any]:
     """Return the table of a TOML text; ``place`` is its name in errors."""
     if _DOTTED.search(content):
-        raise InputError(
-            f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is not a file of this kind"
-        )
+        raise InputError(f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is of another kind")
     try:
         return tomllib.loads(content)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
@@ -366,9 +364,7 @@ def _need_plain(path: Name, file: Any) -> None:
     for name, kind in links:
         if kind != h5py.h5l.TYPE_HARD:
             place = f"{path}: {name.decode(errors='replace')}"
-            raise InputError(
-                f"{place} is {kinds.get(kind, 'a link')}, which is not followed; store the data itself there"
-            )
+            raise InputError(f"{place} is {kinds.get(kind, 'a link')}, which is not followed; store the data itself")
     total = 0
     for name, _ in links:
         dataset = file[name]

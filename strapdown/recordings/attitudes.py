@@ -184,14 +184,11 @@ def _own(path: Path, kind: str) -> Attitudes:
         )
     if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)
-        if record.truth is None:
+        if (truth := record.truth) is None:
             raise InputError(f"{path} is a record without a truth; simulate one, or give another reference")
-        return Attitudes(
-            source=path.name, stamps_ns=whole_ns(record.time), attitude=record.truth.attitude, bias=record.truth.bias
-        )
-    raise InputError(
-        f"{path} is a {kind}, which has no attitudes over time; give an estimate, a record or a trajectory"
-    )
+        stamps = whole_ns(record.time)
+        return Attitudes(source=path.name, stamps_ns=stamps, attitude=truth.attitude, bias=truth.bias)
+    raise InputError(f"{path} is a {kind}, which has no attitudes over time; give an estimate, record or trajectory")
 
 
 def _of_recording(path: Path) -> Attitudes:
@@ -252,9 +249,7 @@ def _table(path: Path) -> Attitudes:
     back = np.diff(stamps[known]) <= 0
     if back.any():
         row = int(np.flatnonzero(known)[1:][back][0]) + 1
-        raise InputError(
-            f"{path.name}: row {row} is not after the one before; sort the rows, or check the unit of time"
-        )
+        raise InputError(f"{path.name}: row {row} is not after the one before; sort the rows, or check the time's unit")
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[known],
@@ -394,9 +389,7 @@ def _ulog(path: Path) -> Attitudes:
         xi = np.stack([quaternion.multiply(ned, [0.0, *axis]) for axis in np.eye(3)], axis=2)
         variance = ulog.columns(rows, "covariances", 4)[kept]
         covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, variance, xi)
-        remarks.append(
-            "The log has the variances of the quaternion without their correlations: σ of the attitude is approximate."
-        )
+        remarks.append("The log has variances of the quaternion without correlations: σ of attitude is approximate.")
     elif number > 0:
         covariance = np.apply_along_axis(np.diag, 1, ulog.columns(rows, "covariances", 3)[kept])
         remarks.append("The log has the variances of the attitude error without their correlations.")

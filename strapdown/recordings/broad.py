@@ -30,13 +30,10 @@ def read_broad(path: Path) -> Recording:
             )
         if kind.startswith("strapdown "):
             raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
-        missing = ["imu_gyr"] * ("imu_gyr" not in file) + ["the attribute sampling_rate"] * (
-            "sampling_rate" not in held
-        )
+        missing = ["imu_gyr"] * ("imu_gyr" not in file)
+        missing += ["the attribute sampling_rate"] * ("sampling_rate" not in held)
         if missing:
-            raise InputError(
-                f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
-            )
+            raise InputError(f"{name} lacks {', '.join(missing)}; it is not of BROAD (has: {', '.join(file)})")
         fields: dict[str, Any] = {field: reading.numbers(file, key) for key, field in _FIELDS.items() if key in file}
         sampling = positive(f"{name}: sampling_rate", held["sampling_rate"], unit="Hz")
         if "movement" in fields:

@@ -210,12 +210,10 @@ def _roles(
             known = UNITS.get(_group(role))
             bare = re.sub(r"\s*[\[(][^\[(]*$", "", cell).lower()
             if bare in names and known:  # brackets that hold no unit
-                raise InputError(
-                    f"{source}: columns: the unit in {cell!r} for {role} is not known (known: {', '.join(known)})"
-                )
-            raise InputError(
-                f"{source} has no column {cell!r} for {role} (it has: {', '.join(c.name for c in columns)})"
-            )
+                units = ", ".join(known)
+                raise InputError(f"{source}: columns: the unit in {cell!r} for {role} is not known (known: {units})")
+            held = ", ".join(column.name for column in columns)
+            raise InputError(f"{source} has no column {cell!r} for {role} (it has: {held})")
         roles[role] = index
         if wanted.unit and cell.lower() not in names:
             unit_by_role[role] = wanted.unit
@@ -394,10 +392,8 @@ def _need_time_unit(source: str, name: str, time: Array) -> None:
     steps = np.abs(np.diff(time))
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
-        plausible = (
-            unit for unit, size in TIME_UNITS.items() if USUAL_INTERVALS[0] <= size * usual <= USUAL_INTERVALS[1]
-        )
-        unit = next(plausible, "us")
+        low, high = USUAL_INTERVALS
+        unit = next((unit for unit, size in TIME_UNITS.items() if low <= size * usual <= high), "us")
         raise InputError(
             f"{source}: the stamps of {name} are {usual:g} apart, not plausible in seconds; declare the unit, as in {name} [{unit}], or by "
             f"{Hint('units', {'time': unit})} ({', '.join(TIME_UNITS)})"

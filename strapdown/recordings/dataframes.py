@@ -70,9 +70,7 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
         return _of_arrow(library("pyarrow", f"{source} of {type(table).__module__.partition('.')[0]}").table(table))
     if isinstance(table, np.ndarray):
         if table.dtype.names is None:
-            raise InputError(
-                f"{source} is an array without names of columns; give a structured array or arrays by name"
-            )
+            raise InputError(f"{source} is an array without names of columns; give a structured one or arrays by name")
         table = {name: table[name] for name in table.dtype.names}
     columns: dict[str, NDArray[np.generic]] = {}
     if hasattr(table, "columns"):  # a DataFrame

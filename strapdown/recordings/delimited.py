@@ -101,9 +101,8 @@ class Table:
         try:
             return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
         except ValueError:
-            raise InputError(
-                f"{self.source}: data row {row + 1}, column {self.header[place]} is {cell!r}, not a number"
-            ) from None
+            where = f"data row {row + 1}, column {self.header[place]}"
+            raise InputError(f"{self.source}: {where} is {cell!r}, not a number") from None
 
     def clock_ns(self, k: int, unit: str) -> NDArray[np.int64] | None:
         """Return the stamps of a loaded column of a unit, "" if unknown, that counts ns from 1970; None for other columns."""
@@ -136,9 +135,8 @@ def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]
     separator = max(SEPARATORS, key=titles[0].count)
     cells = [next(csv.reader([title], delimiter=separator)) for title in titles]
     # A second row belongs to the header if it has no number, and the width of the first.
-    if len(cells) == 2 and (
-        len(cells[0]) != len(cells[1]) or any(is_number(cell) and cell.strip() for cell in cells[1])
-    ):
+    numbers = any(is_number(cell) and cell.strip() for cell in cells[-1])
+    if len(cells) == 2 and (numbers or len(cells[0]) != len(cells[1])):
         first, cells = [titles[1], *first], cells[:1]  # a data row that is not numeric: the error names its place
     names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
     while names and not names[-1]:
@@ -154,9 +152,8 @@ def _date(cell: str) -> int | None:
         date = datetime.datetime.fromisoformat(cell.strip())
     except ValueError:
         return None
-    since = (date if date.tzinfo else date.replace(tzinfo=datetime.UTC)) - datetime.datetime(
-        1970, 1, 1, tzinfo=datetime.UTC
-    )
+    date = date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
+    since = date - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import InputError, one_of
+from strapdown.checks import Hint, InputError, one_of
 from strapdown.files import reading
 from strapdown.recordings import bag_files, broad, dataframes, delimited, ros, telemetry, trajectories, ulog
 from strapdown.recordings.body_axes import with_axes
@@ -190,8 +190,7 @@ def read(
     options = {"units": units or {}, "columns": columns or {}, "topic": topic, "gyro_alone": gyro_alone}
     for name, reason in _REASONS.items():
         if options[name] and name not in file_format.options:
-            which = f" for {', '.join(units)}" if units and name == "units" else ""
-            raise InputError(f"{file.name} ({file_format.name}): {reason} drop the option{which}")
+            raise InputError(f"{file.name} ({file_format.name}): {reason} leave {Hint(name, options[name])} out")
     options = {name: value for name, value in options.items() if name in file_format.options}
     with reading.from_file(file, file_format.name):
         recording: Recording = file_format.read(file, **options)
@@ -229,9 +228,7 @@ def estimate_format(
     file_format = _by_ending(path, "write_estimate")
     for name, value in (options or {}).items():
         if name not in file_format.estimate_options:
-            raise InputError(
-                f"{path} ({file_format.name}) has no option {name}; leave it out, or choose another extension"
-            )
+            raise InputError(f"{path} ({file_format.name}) has no option {name}; leave it out, or change the extension")
         if name == "frame":
             one_of("frame", value, outputs.FRAMES)
         elif name == "sequence":
@@ -257,9 +254,7 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
         if getattr(file_format, kind) and ending in file_format.endings:
             return file_format
     what = "an estimate" if kind == "write_estimate" else "a recording"
-    raise InputError(
-        f"{path} ends in {ending!r}, but {what} is written as {', '.join(writers(kind))}; choose one of these extensions"
-    )
+    raise InputError(f"{path} ends in {ending!r}, but {what} is written as {', '.join(writers(kind))}; choose one")
 
 
 def from_record(record: ImuRecord, source: str = "record") -> Recording:

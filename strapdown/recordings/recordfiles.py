@@ -134,9 +134,8 @@ def origin_of(attributes: Mapping[str, Any], path: str | os.PathLike[str], *, so
 
     ``source`` is that of an origin whose attributes do not name one.
     """
-    origin: dict[str, Any] = {
-        name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
-    }
+    held = [name for name in ("seed", "run") if name in attributes]
+    origin: dict[str, Any] = {name: count(name, attributes[name], minimum=0) for name in held}
     if "epoch_ns" in attributes:
         origin["epoch_ns"] = epoch_of(attributes)
     if "gyro" in attributes:

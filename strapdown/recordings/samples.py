@@ -100,10 +100,8 @@ def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: 
         return _of_recording(content, sensor)
     if sensor == "gyro":
         interval = sample_interval(source, content.time[1:])
-        temperature = None if content.temperature is None else content.temperature[1:]
-        return GyroSamples(
-            values=content.increments, sample_interval=interval, kind="increments", temperature=temperature
-        )
+        T = None if content.temperature is None else content.temperature[1:]
+        return GyroSamples(values=content.increments, sample_interval=interval, kind="increments", temperature=T)
     kinds = {series.sensor: series.kind for series in content.vectors}
     if kinds.get(sensor, "vector") != "vector":
         raise InputError(

@@ -288,14 +288,12 @@ def stuck_words(recording: Recording) -> list[str]:
                 "check the sensor"
             )
     for sensor in ("accelerometer", "magnetometer"):
-        samples = getattr(recording, SENSORS[sensor])
-        if samples is None:
+        if (samples := getattr(recording, SENSORS[sensor])) is None:
             continue
         compiled(recording_samples.longest_runs)(read_only(samples), runs)
         first, last = int(runs[:, 0].max()), int(runs[:, 1].min())
-        vector = samples[first]
-        # Perpendicular to it: a rotation about a vector does not change it.
-        if (when := stuck(first, last)) and _rms(np.cross(rate[first : last + 1], vector)) > ROTATES * _rms(vector):
+        turn = np.cross(rate[first : last + 1], samples[first])  # a rotation about a vector does not change it
+        if (when := stuck(first, last)) and _rms(turn) > ROTATES * _rms(samples[first]):
             warnings.append(f"the {sensor} is stuck at one value {when}, while the gyro turns it; check the sensor")
     return warnings
 

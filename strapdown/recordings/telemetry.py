@@ -47,9 +47,7 @@ def read_telemetry(file: Path) -> Recording:
         rows: list[dict[str, Any]] = log.normalized_imu()
     rate, force, field = (_samples(rows, name) for name in ("gyro", "accl", "magn"))
     if len(rows) < 2 or rate is None:
-        raise InputError(
-            f"{file.name} ({log.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"
-        )
+        raise InputError(f"{file.name} ({log.camera or 'unknown'}) has no gyro samples; give a log with raw ones")
     time = np.array([row["timestamp_ms"] for row in rows], np.float64) / 1e3
     device = " ".join(part for part in (log.camera, log.model) if part)
     return with_gyro(

@@ -66,9 +66,8 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
         )
     norm = np.linalg.norm(rows[:, 4:], axis=1)
     if np.any(norm < 0.5):
-        raise InputError(
-            f"{file.name}: data row {int(np.argmin(norm)) + 1} has a quaternion of norm below 0.5; it must be 1"
-        )
+        row = int(np.argmin(norm)) + 1
+        raise InputError(f"{file.name}: data row {row} has a quaternion of norm below 0.5; it must be 1")
     return stamps, quaternion.normalize(rows[:, [7, 4, 5, 6]])
 
 

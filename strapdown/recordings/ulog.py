@@ -155,7 +155,7 @@ def _need_fields(file: Path, name: str, definitions: Mapping[str, Any], known: d
         )
     if known[name] > LONGEST:
         raise InputError(
-            f"{file.name} cannot be read: its message {name} has more than {LONGEST} fields; it is damaged"
+            f"{file.name} cannot be read: its message {name} has more than {LONGEST} fields, as if damaged"
         )
     return known[name]
 

@@ -296,9 +296,8 @@ class Estimate(ByValue, Listed):
             if np.any(innovations.used):
                 nis = np.mean(innovations.nis[innovations.used]) / innovations.innovation.shape[1]
                 gate = f", {innovations.refused} rejected by the gate" if innovations.refused else ""
-                unused = (
-                    f", {number} more missing or outside the record" if (number := self.skipped.get(sensor)) else ""
-                )
+                missing = self.skipped.get(sensor)
+                unused = f", {missing} more missing or outside the record" if missing else ""
                 notes.append(
                     f"{sensor}: {len(innovations.time)} measurements{gate}{unused}, mean NIS per degree of freedom {figure(nis, 3)}"
                 )

@@ -120,7 +120,7 @@ class Recording(Listed):
                     value = None
                 elif sensor != "reference" and not np.any(np.abs(value) > 0.0):
                     raise InputError(
-                        f"{self.source}: {name} is 0 in every row, as if there were no such sensor; leave its columns out"
+                        f"{self.source}: {name} is 0 in every row, as without a sensor; leave its columns out"
                     )
                 object.__setattr__(self, name, value)
         if self.temperature is not None:
@@ -171,9 +171,7 @@ class Recording(Listed):
         """
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[which] for n in _ROWS}
         begin, end = parts["time"][[0, -1]]
-        missing, repeated = (
-            stamps[(begin < stamps) & (stamps <= end)] for stamps in (self.missing_gyro, self.repeated)
-        )
+        missing, repeated = (x[(begin < x) & (x <= end)] for x in (self.missing_gyro, self.repeated))
         return replace(self, missing_gyro=missing, repeated=repeated, **parts)
 
     def rows_of(self, time: Array) -> NDArray[np.int64]:
@@ -245,13 +243,11 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                 f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
             )
         stamps = increasing(f"{source}: time", columns["time"])
-        moved = {
-            name: at_nearest(stamps[known], stamps[there], columns[name][there])[0]
-            for name in ("specific_force", "magnetic_field")
-            if name in columns
-            and np.shape(columns[name])[:1] == known.shape
-            and len(there := np.flatnonzero(~np.isnan(columns[name]).any(axis=1)))
-        }
+        moved = {}
+        for name in ("specific_force", "magnetic_field"):
+            if (values := columns.get(name)) is not None and len(values) == len(known):
+                there = ~np.isnan(values).any(axis=1)
+                moved[name] = at_nearest(stamps[known], stamps[there], values[there])[0]
         columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known]}
     return Recording(source=source, **columns)
 

@@ -106,9 +106,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
         if attributes.get("kind") != KIND:
-            raise InputError(
-                f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
-            )
+            raise InputError(f"{path} is not a strapdown estimate; give the estimate.h5 of `strapdown estimate`")
         time = increasing(reading.place(file, "time"), numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
@@ -123,9 +121,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             if "whole_covariance" in file
             else None,
             innovations=innovations(file),
-            skipped={
-                str(own["sensor"]): count("skipped", own["number"], minimum=0) for own, _ in parts(file, "skipped")
-            },
+            skipped={str(of["sensor"]): count("skipped", of["number"], minimum=0) for of, _ in parts(file, "skipped")},
             events=tuple(
                 Event(
                     kind=one_of("kind of an event", own["kind"], EVENT_KINDS),
@@ -184,9 +180,8 @@ def _truth(file: Any, rows: int) -> Truth:
     if "truth/row" in file:
         row = numbers(file, "truth/row", ("m",)).astype(np.intp)
         if np.any(np.diff(row, prepend=-1) <= 0) or np.any(row >= rows):
-            raise InputError(
-                f"{reading.place(file, 'truth/row')} are not increasing rows of the estimate; the file is damaged"
-            )
+            place = reading.place(file, "truth/row")
+            raise InputError(f"{place} are not increasing rows of the estimate; the file is damaged")
     attitude = np.full((rows, 4), np.nan)
     attitude[row] = _attitudes(file, "truth/attitude", len(row))
     bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
@@ -198,9 +193,7 @@ def _states(attributes: dict[str, Any], part: Any, rows: int) -> ErrorStateEstim
     """Return the estimate of one group of error states."""
     values = numbers(part, "values", (rows, len(attributes["components"])))
     if len(attributes["units"]) != len(attributes["components"]):
-        raise InputError(
-            f"{reading.place(part, 'units')} and components differ in number; the file is damaged, make it again"
-        )
+        raise InputError(f"{reading.place(part, 'units')} and components differ in number; the file is damaged")
     return ErrorStateEstimate(
         components=tuple(map(str, attributes["components"])),
         units=tuple(map(str, attributes["units"])),
