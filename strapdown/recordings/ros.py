@@ -174,9 +174,9 @@ def topic_of(name: str, topics: Mapping[str, Topic], topic: str, what: str, kind
 
 def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str | None:
     """Return the topic of a kind that belongs to one of the inertial units: the only one of its namespace or, failing that, of none's."""
-    within = lambda t, name: "/" in name[1:] and t.name.startswith(name.rpartition("/")[0] + "/")  # noqa: E731
-    own = [t for t in candidates if within(t, unit)]
-    near = own or [t for t in candidates if not any(within(t, other) for other in units)]
+    space = {name: name.rpartition("/")[0] + "/" for name in units if "/" in name[1:]}
+    own = [t for t in candidates if unit in space and t.name.startswith(space[unit])]
+    near = own or [t for t in candidates if not t.name.startswith(tuple(space.values()))]
     if len(near) == 1 or not candidates:
         return near[0] if near else None
     names = ", ".join(t.name for t in candidates)
