@@ -53,6 +53,10 @@ def with_rate(recording: Recording, limit: float) -> Recording:
     return dataclasses.replace(recording, rate=np.clip(recording.rate, -limit, limit))
 
 
+def interpolated(rate: np.ndarray) -> list[tuple[int, int]]:
+    return sensor_faults.interpolated(rate, sensor_faults.second_differences(rate))
+
+
 def test_samples_at_the_limit_are_recognised():
     plain = swing().rate
     clipped = np.clip(plain, -5.0, 5.0)
@@ -256,7 +260,7 @@ def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
     plain = swing()
     broken = filled(plain, *spans)
     rows = np.rint(RATE * np.array(spans)).astype(int)
-    assert sensor_faults.interpolated(broken.rate) == [tuple(span) for span in rows.tolist()]
+    assert interpolated(broken.rate) == [tuple(span) for span in rows.tolist()]
     _, nees, ahrs_estimate = off_by(broken, smooth=smooth)
     assert "Gaps filled by interpolation: 3, up to 1.9 s" in ahrs_estimate.faults.words[0]
     gap = np.concatenate([np.arange(first + 1, last) for first, last in rows])
@@ -276,9 +280,23 @@ def test_the_turn_over_a_long_gap_has_a_variance_of_one():
 def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():
     level = np.zeros((200, 3))
     level[100:, 1] = 0.01  # a coarse gyro
-    assert sensor_faults.interpolated(level) == []
-    assert sensor_faults.interpolated(np.random.default_rng(1).normal(0.0, 1e-3, (5000, 3))) == []
-    assert sensor_faults.interpolated(np.zeros((5, 3))) == []
+    assert interpolated(level) == []
+    assert interpolated(np.random.default_rng(1).normal(0.0, 1e-3, (5000, 3))) == []
+    assert interpolated(np.zeros((5, 3))) == []
+
+
+def test_a_gyro_sampled_too_slowly_is_reported_with_its_error():
+    """The error of the trapezoidal rule for a sinusoid: T (ω₀ + ω₁)/2 less its integral."""
+    frequency, time = 6.0, np.arange(0.0, 40.0, 0.1)
+    rate = np.zeros((len(time), 3))
+    rate[:, 1] = 3.0 * np.sin(frequency * time)
+    slow = dataclasses.replace(swing(4.0).taken(slice(len(time))), time=time, rate=rate)
+    error = 0.05 * (rate[1:, 1] + rate[:-1, 1]) + 3.0 / frequency * np.diff(np.cos(frequency * time))
+    (words,) = sensor_faults.find(slow).words
+    assert "samples at 10 Hz" in words
+    reported = float(words.partition("about ")[2].split()[0]) * DEGREE
+    assert reported == pytest.approx(np.sqrt(np.mean(error**2) / 0.1), rel=0.05)
+    assert sensor_faults.find(dataclasses.replace(slow, rate=0.1 * rate)).words == ()
 
 
 def test_a_clipped_accelerometer_is_left_out():
