@@ -477,6 +477,12 @@ def test_a_tracker_looks_where_it_is_mounted(boresight):
     np.testing.assert_allclose(error.T @ error / len(error), expected, atol=0.04e-6)
 
 
+def test_a_boresight_from_a_file_is_that_of_the_sensor_to_the_bit():
+    """A vector of unit length is not divided by its length again, which changes the last bit of (0, 1, 1)/√2."""
+    tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=(0.0, 1.0, 1.0))
+    assert dataclasses.replace(tracker).boresight == tracker.boresight
+
+
 @pytest.mark.parametrize(("boresight", "axis"), [("-x", "x"), ((0.0, -2.0, 0.0), "y"), ((1.0, 0.0, 0.0, 0.0), "z")])
 def test_a_boresight_along_a_body_axis_is_that_axis(boresight, axis):
     tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)

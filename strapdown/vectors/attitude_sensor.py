@@ -9,6 +9,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, non_negative, numbers, one_of, unit_quaternions
+from strapdown.vectors.measurements import direction
 from strapdown.vectors.sensor import Sampled, attitude_of
 
 Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -32,10 +33,7 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
         raise InputError(
             f"{name} has shape {components.shape}; give x, y or z, a direction (3,), or the mounting as a quaternion (4,) or matrix (3, 3)"
         )
-    length = float(np.linalg.norm(b))
-    if not np.isfinite(length) or length == 0.0:
-        raise InputError(f"{name} is {value!r}, not a direction; give x, y or z, or three numbers not all zero")
-    b = b / length
+    b = direction(name, b)
     k = int(np.argmax(np.abs(b)))
     return "xyz"[k] if abs(b[k]) > 1.0 - 1e-12 else tuple(b.tolist())
 
