@@ -756,6 +756,17 @@ def test_the_initial_bias_contains_the_part_too_fast_for_a_state():
     np.testing.assert_allclose(analysis.filter_sigma[0, 3:], belief.bias_sigma, rtol=1e-9)
 
 
+def test_only_an_error_that_is_drawn_in_every_run_is_said_to_average_out():
+    scenario, belief = with_states()
+    analysis = covariance.analyse(scenario, belief, epochs=2)
+    large = 3.0 * analysis.filter_sigma[:, None, :]
+    fixed = dataclasses.replace(analysis, fixed=("scale",), fixed_errors=large)
+    assert fixed.words.startswith("For a unit with exactly the specified constant errors, the filter is optimistic")
+    considered = dataclasses.replace(fixed, considered=("mounting",), considered_errors=large)
+    for other in (considered, dataclasses.replace(fixed, units_drawn=False)):
+        assert other.words.startswith("The filter will be optimistic in ")
+
+
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     options = ("--epochs", 10, "--consider", "misalignment=0.1", "--consider", "star.delay=2")
     said = succeeds("covariance", "spin", "--no-states", *options)
@@ -773,7 +784,9 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     assert np.allclose(np.array(saved["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
     assert np.allclose(np.array(saved["rms"]["bias_deg_per_hour"]) * DEGREE / 3600.0, direct.rms[:, 3:])
     assert np.allclose(saved["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
-    assert f"optimistic in bias: √NEES is {np.sqrt(direct.expected_nees[-1, 2]):.3g}." in " ".join(said.split())
+    assert f"The filter will be optimistic in bias: √NEES is {np.sqrt(direct.expected_nees[-1, 2]):.3g}." in " ".join(
+        said.split()
+    )
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
 

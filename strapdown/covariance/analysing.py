@@ -109,6 +109,7 @@ def analyse(
         considered=tuple(column.name for column in considered),
         considered_errors=out.columns[:, len(fixed) :],
         expected_nis=_expected_nis(scenario, out.nis),
+        units_drawn=setup.states is not None and setup.states.has_constants,
         left_out=_left_out(scenario, setup),
         beyond_linear=_beyond_linear(attitude_sigma, columns, sizes, consider),
     )

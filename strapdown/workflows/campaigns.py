@@ -39,13 +39,12 @@ def plan(
         need_alone(gyro, states)
         setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=False), estimator=setup)
     filter_setup = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
-    names = () if filter_setup.states is None else filter_setup.states.names
     return montecarlo.Plan(
         scenario=scenario,
         setup=filter_setup,
         seed=scenario.seed if seed is None else seed,
         epochs=montecarlo.whole_epochs(scenario, filter_setup),
-        individuals=any(not name.endswith((".drift", ".correlated")) for name in names),
+        individuals=filter_setup.states is not None and filter_setup.states.has_constants,
         dispersions=dispersions or montecarlo.Dispersions(),
     )
 

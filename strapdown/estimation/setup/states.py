@@ -268,6 +268,11 @@ class States(ByValue):
             names += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(states, fields)]
         return tuple(names)
 
+    @property
+    def has_constants(self) -> bool:
+        """Whether there are states for errors that are constant in a run and differ from unit to unit."""
+        return any(not name.endswith((".drift", ".correlated")) for name in self.names)
+
     def select(self, names: tuple[str, ...]) -> States:
         """Return only the states with these names.
 
