@@ -316,9 +316,11 @@ def command(run, tmp_path):
 SCALAR = ("--machine", "scalar")
 
 
-def test_the_command_computes_prints_and_writes(command):
+def test_the_command_computes_prints_and_writes(command, monkeypatch):
+    judged, judge = [], statistics.Statistics.judge
+    monkeypatch.setattr(statistics.Statistics, "judge", lambda *a, **k: judged.append(a) or judge(*a, **k))
     status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
-    assert (status, error) == (3, "")  # 30 runs cannot tell
+    assert (status, error, len(judged)) == (3, "", 1)  # 30 runs cannot tell
     assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (

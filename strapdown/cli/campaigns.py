@@ -80,14 +80,14 @@ def montecarlo(
         return None
     new = held is None or target != source or computing.resume or computing.overwrite
     result = held if held is not None and not new else _computed(plan, target, source.stem, computing)
-    ui.show(sd.check(result).listing(), title=ui.EVIDENCE)
-    content = result.summary()
+    ui.show((judgement := sd.check(result)).listing(), title=ui.EVIDENCE)
+    content = result.summary(judgement)
     ui.show(*verdicts.tables(content))
-    ui.say("Use --replay to examine a run.", *result.words)
+    ui.say("Use --replay to examine a run.", *result.words(judgement))
     if new:
         write_json(beside, content)
         ui.written(target, beside)
-    return {"verdict": content["judgement"]["verdict"]}
+    return {"verdict": judgement.verdict}
 
 
 def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | None, Plan]:

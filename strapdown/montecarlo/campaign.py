@@ -27,6 +27,7 @@ import numpy as np
 import strapdown
 from strapdown import scenarios
 from strapdown.checks import Hint, InputError, count, finite, one_of
+from strapdown.consistency import Judgement
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
@@ -99,8 +100,13 @@ class Campaign(Listed):
             return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self, judgement: Judgement | None = None) -> dict[str, Any]:
         """Return plan, provenance, verdict and statistics as plain values for JSON.
+
+        Parameters
+        ----------
+        judgement : Judgement, optional
+            Verdict, if known. Default: that of :meth:`Statistics.judge`.
 
         Returns
         -------
@@ -109,7 +115,11 @@ class Campaign(Listed):
             :func:`strapdown.montecarlo.summary` returns.
         """
         statistics = self.statistics
-        own = {} if statistics is None else verdicts.summary(statistics, bound=verdicts.bound_of(self.plan))
+        own = (
+            {}
+            if statistics is None
+            else verdicts.summary(statistics, judgement=judgement, bound=verdicts.bound_of(self.plan))
+        )
         return {
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
@@ -121,15 +131,10 @@ class Campaign(Listed):
             **own,
         }
 
-    @property
-    def words(self) -> list[str]:
-        """Extent, verdict, and what would make it clearer, of a campaign with finished runs."""
-        assert self.statistics is not None
-        judgement, filter_setup = self.statistics.judge(), self.plan.setup
-        words = [
-            f"{self.extent}, computed in {self.seconds:.3g} s.",
-            judgement.words,
-        ]
+    def words(self, judgement: Judgement) -> list[str]:
+        """Return extent, verdict, and what would make it clearer."""
+        filter_setup = self.plan.setup
+        words = [f"{self.extent}, computed in {self.seconds:.3g} s.", judgement.words]
         if judgement.verdict == "cannot tell":
             words.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
         if judgement.unmodelled and filter_setup.states is None and filter_setup.estimator == setup.MEKF:

@@ -44,7 +44,11 @@ def efficiency(statistics: Statistics, bound: Array) -> Array:
 
 
 def summary(
-    statistics: Statistics, *, epochs: Counts | None = None, confidence_level: float = 0.99, bound: Array | None = None
+    statistics: Statistics,
+    *,
+    epochs: Counts | None = None,
+    judgement: consistency.Judgement | None = None,
+    bound: Array | None = None,
 ) -> dict[str, Any]:
     """Return the verdict (:meth:`Statistics.judge`) and numbers: mean ANEES, coverage, errors, worst runs; units in the names.
 
@@ -54,8 +58,8 @@ def summary(
         Statistics of the filter to be tested.
     epochs : array of int, optional
         Indices of the epochs judged. Default: 20 evenly spaced ones.
-    confidence_level : float, default 0.99
-        Probability that a consistent filter passes all tests together.
+    judgement : Judgement, optional
+        Verdict on these epochs, if known. Default: that of :meth:`Statistics.judge`.
     bound : ndarray (m, 6, 6), optional
         Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), with which the errors are compared.
 
@@ -65,7 +69,7 @@ def summary(
         Plain values for JSON.
     """
     rows = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    judgement = statistics.judge(epochs=rows, confidence_level=confidence_level)
+    judgement = judgement or statistics.judge(epochs=rows)
     covered = statistics.covered[rows]
     table = {
         "judgement": judgement.summary(),

@@ -27,7 +27,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         raise InputError(f"{path} has no completed run yet; continue the campaign first, {Hint('resume', True)}")
     judgement = workflows.check(held)
     bound = verdicts.bound_of(held.plan)
-    numbers = verdicts.summary(statistics, bound=bound)
+    numbers = verdicts.summary(statistics, judgement=judgement, bound=bound)
     ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
     name = held.plan.scenario.name or "a scenario"
