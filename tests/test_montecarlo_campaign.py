@@ -22,7 +22,7 @@ from spin_plan import PLAN, SCENARIO, SETUP, assert_same
 from strapdown import montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
-from strapdown.files import reading
+from strapdown.files import locked, reading
 from strapdown.montecarlo import campaign, engine, scalar, statistics
 from strapdown.recordings import recordfiles
 
@@ -277,6 +277,8 @@ def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
         go(path, 8, resume=True)
     assert path.read_text() == "the only copy of my thesis"
     assert go(path, 2, overwrite=True).finished
+    with locked(path), pytest.raises(InputError, match="being written by another process"):
+        go(path, 2)  # it is not read before it is locked
 
 
 def test_files_that_are_no_campaign_are_refused(of_21_runs, tmp_path):

@@ -217,12 +217,12 @@ def run(
     target = Path(path)
     count("runs", runs)
     table = plan.to_table()
-    if not resume and not overwrite and _would_lose(target):
-        raise InputError(
-            f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
-        )
     engine = choose(plan, machine)
     with locked(target), _asked_to_stop() as stop_if_asked:
+        if not resume and not overwrite and _would_lose(target):
+            raise InputError(
+                f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
+            )
         held = read(target) if resume and target.exists() else None
         default = MACHINES[engine.machine].CHUNK if held is None else held.chunk
         size = default if chunk is None else count("chunk", chunk)
