@@ -189,6 +189,6 @@ if __name__ == "__main__":
             f"{subset} {measured.anees[-1, k]:.3f} ({predicted.anees(subset)[-1]:.3f})"
             for k, subset in ((1, "attitude"), (2, "bias"))
         ]
-        verdict = "consistent" if montecarlo.summary(measured)["consistent"] else "NOT consistent"
+        verdict = measured.judge().verdict
         print(f"{name:6s} NEES of {', '.join(parts)}, NIS {measured.nis[-1]:.3f} ({predicted.nis[-1]:.3f}): {verdict}")
     print("figures:", *result.figures)

@@ -206,7 +206,7 @@ class FilterOutcome:
             "nis": statistics.mean_nis,
             "nis_bounds": list(statistics.nis_bounds()),
             "verdict": verdict,
-            "consistent": verdict != "not consistent",
+            "consistent": verdict == "consistent",
         }
 
 

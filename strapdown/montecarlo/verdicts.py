@@ -89,7 +89,7 @@ def summary(
             {"run": int(run), "largest_nees": score}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
         ],
-        "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
+        "consistent": statistics.failed == 0 and judgement.verdict == "consistent",
     }
     return plain(table)  # type: ignore[no-any-return]
 
