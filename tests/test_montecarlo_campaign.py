@@ -19,6 +19,7 @@ from hdf5 import changed
 from measured import errors_at
 from spin_plan import PLAN, SCENARIO, SETUP, assert_same
 
+import strapdown as sd
 from strapdown import montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
@@ -357,6 +358,8 @@ def test_the_command_matches_the_filter_to_a_data_sheet(command):
     assert plan.scenario.gyro == SCENARIO.gyro
     assert plan.setup.process_noise.angle_random_walk == pytest.approx(0.9 * np.pi / 10800.0)
     assert plan.setup.process_noise.rate_random_walk == pytest.approx(6.0 * np.pi / 180.0 / 3600.0 / 60.0)
+    options = {"runs": 4, "states": False, "noise": sd.gyro.read_spec("gyro.toml")}
+    assert sd.monte_carlo("other.toml", **options).plan == plan
     Path("filter.toml").write_text(setups.to_toml(plan.setup), encoding="utf-8")
     status, _, error = command("short.toml", "--gyro", "gyro.toml", "--filter", "filter.toml")
     assert status == 2

@@ -112,7 +112,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
         return held, held.plan
     plan = workflows.plan(
         sd.scenarios.load_scenario(scenario),
-        gyro=None if model.gyro is None else sd.gyro.read_spec(model.gyro),
+        noise=None if model.gyro is None else sd.gyro.read_spec(model.gyro),
         setup=read_setup(place) if place is not None and setup is None else setup,
         seed=model.seed,
         states=model.states,

@@ -15,6 +15,7 @@ from strapdown.scenarios import Scenario
 from strapdown.workflows.filters import filter_for_scenario, need_alone
 
 if TYPE_CHECKING:
+    from strapdown.allan import NoiseFit
     from strapdown.montecarlo import Dispersions, Plan, Statistics
 
 
@@ -22,23 +23,23 @@ def plan(
     scenario: Scenario,
     *,
     setup: FilterSetup | Own | None = None,
-    gyro: GyroSpec | None = None,
+    noise: GyroSpec | NoiseFit | None = None,
     seed: int | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
 ) -> Plan:
     """Return the plan of a Monte Carlo: a scenario with the filter that matches it, or with another ``setup``.
 
-    ``gyro``: gyro specification assumed by the matched filter, such as that of a data sheet; default: that of the scenario.
+    ``noise``: gyro assumed by the matched filter, such as that of a data sheet; default: that of the scenario.
     ``states``: whether the matched filter has an error state for each error that the scenario specifies; default: if there are such errors.
     If constant errors have states, each run draws its own gyro and sensors, since the filter is consistent on average over such units only.
     """
     from strapdown import montecarlo
 
     if isinstance(setup, Own):
-        need_alone(gyro, states)
+        need_alone(noise, states)
         setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=False), estimator=setup)
-    filter_setup = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
+    filter_setup = filter_for_scenario(scenario, setup=setup, noise=noise, states=states)
     return montecarlo.Plan(
         scenario=scenario,
         setup=filter_setup,
@@ -54,6 +55,7 @@ def monte_carlo(
     *,
     runs: int = 1000,
     seed: int | None = None,
+    noise: GyroSpec | NoiseFit | None = None,
     setup: FilterSetup | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
@@ -72,8 +74,8 @@ def monte_carlo(
         Number of independent runs.
     seed : int, optional
         Seed of the random numbers. Default: that of the scenario.
-    setup : FilterSetup, optional
-        The filter. Default: matched to the scenario.
+    noise, setup : optional
+        Gyro assumed by the matched filter, or the complete filter; as for :func:`estimate`.
     states : bool, optional
         Whether the matched filter has an error state for each error that the scenario specifies. Default: True if there are such errors.
     dispersions : Dispersions, optional
@@ -95,5 +97,7 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    campaign = plan(scenarios.as_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    campaign = plan(
+        scenarios.as_scenario(scenario), noise=noise, setup=setup, seed=seed, states=states, dispersions=dispersions
+    )
     return montecarlo.run_plan(campaign, runs=runs, threads=threads, progress=progress)

@@ -28,7 +28,9 @@ def specification_of(noise: GyroSpec | NoiseFit) -> GyroSpec:
     if isinstance(noise, allan.NoiseFit):
         return GyroSpec(**allan.to_gyro_parameters(noise))  # type: ignore[arg-type]
     if not isinstance(noise, GyroSpec):
-        raise InputError(f"noise is {type(noise).__name__}; give a GyroSpec, a NoiseFit or a ProcessNoise")
+        raise InputError(
+            f"noise is {type(noise).__name__}; give a GyroSpec or a NoiseFit, for an estimate also a ProcessNoise"
+        )
     return noise
 
 
@@ -134,15 +136,15 @@ def filter_for_scenario(
     scenario: Scenario,
     *,
     setup: FilterSetup | None = None,
-    gyro: GyroSpec | None = None,
+    noise: GyroSpec | NoiseFit | None = None,
     states: bool | Sequence[str] | None = None,
 ) -> FilterSetup:
-    """Return the filter for a scenario: ``setup``, or one that matches it, assuming another ``gyro`` if given."""
+    """Return the filter for a scenario: ``setup``, or one that matches it, assuming the ``noise`` of another gyro if given."""
     if setup is None:
-        assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+        assumed = scenario if noise is None else dataclasses.replace(scenario, gyro=specification_of(noise))
         return setups.FilterSetup.for_scenario(assumed, states=states)
     setups.need_setup(setup)
-    need_alone(gyro, states)
+    need_alone(noise, states)
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
     setups.need_angles(setup, kinds, "filter")
     return setup
