@@ -126,6 +126,9 @@ def test_measurement_density_counts_what_each_kind_measures():
     for series, information in ((compass, 100.0), (field, 200.0), (tracker, 100.0 + 25.0 + 6.25)):
         single = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
         assert setup.matching.measurement_density(single) == pytest.approx(8.0 / (4.0 * information / 3.0))
+        ideal = {"sigma_axes": np.zeros(3)} if series.attitude is not None else {"sigma": np.zeros(4)}
+        no_noise = dataclasses.replace(single, vectors=(dataclasses.replace(series, **ideal),))
+        assert setup.matching.measurement_density(no_noise) == np.inf  # without a warning
 
 
 def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():

@@ -288,11 +288,11 @@ def measurement_density(record: ImuRecord) -> float:
 
 
 def _information(series: VectorMeasurements) -> float:
-    """Return Σ 1/σ² about an axis, the mean over the three axes, 1/rad²."""
+    """Return Σ 1/σ² about an axis, the mean over the three axes, 1/rad²; without the samples of σ zero, which a filter refuses."""
     if series.attitude is not None:
         assert series.sigma_axes is not None
-        return float(np.sum(series.sigma_axes**-2.0)) / 3.0
-    known = np.isfinite(series.vector_b).all(axis=1)
+        return float(np.sum(series.sigma_axes[series.sigma_axes > 0.0] ** -2.0)) / 3.0
+    known = np.isfinite(series.vector_b).all(axis=1) & (series.sigma > 0.0)
     length = np.linalg.norm(series.references_f, axis=1) if series.kind == "vector" else np.ones(len(series.time))
     share = 1.0 / 3.0 if series.kind == "heading" else 2.0 / 3.0
     return share * float(np.sum((length[known] / series.sigma[known]) ** 2))
