@@ -198,7 +198,10 @@ def test_sigma_grows_over_a_dropout():
     for begin in (10.0, 20.0, 30.0):
         kept[round(begin * RATE) : round((begin + 0.2) * RATE)] = False
     _, nees, ahrs_estimate = off_by(plain.taken(kept))
-    assert "Intervals between stamps longer than 1.5 median ones: 3, up to 0.205 s" in ahrs_estimate.faults.words[0]
+    assert (
+        "Intervals between stamps longer than 1.5 median ones: 3, the longest 0.205 s after 9.99"
+        in ahrs_estimate.faults.words[0]
+    )
     assert np.mean(nees < 7.81) > 0.9
     sigma = np.sqrt(ahrs_estimate.estimate.variance[:, :3].sum(axis=1))
     row = int(np.searchsorted(ahrs_estimate.recording.time, 20.1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from strapdown.ahrs.estimating import AhrsEstimate
-from strapdown.recordings import Recording, gaps
+from strapdown.recordings import Recording
 from strapdown.units import DEGREE
 
 MAX_BIAS = 4.0
@@ -37,19 +37,11 @@ def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         unit = used.magnetic_unit or "(unit of the magnetometer)"
         sentences.append(f"Hard iron of ({iron}) {unit}, body axes, is estimated at the end.")
-    sentences += [f"{gap_words(gaps(used.time))}.", used.left_out_words]
+    sentences.append(used.left_out_words)
     for sensor, number in result.estimate.skipped.items():
         if number:
             sentences.append(f"{number} of the gyro's samples have no sample of the {sensor} at the same time.")
-    return tuple(sentence for sentence in sentences if sentence.strip("."))
-
-
-def gap_words(intervals: list[tuple[float, float]]) -> str:
-    """Return how many gaps between stamps there are, begin and length of each given, and the longest; empty without any."""
-    if not intervals:
-        return ""
-    begin, length = max(intervals, key=lambda gap: gap[1])
-    return f"Gaps between stamps: {len(intervals)}, the longest {length:.3g} s after {begin:.3f} s"
+    return tuple(filter(None, sentences))
 
 
 def _model(moved_by: str, result: AhrsEstimate) -> str:

@@ -130,8 +130,8 @@ def find(recording: Recording) -> Faults:
     if len(long):
         variance[long] += turn_variance_over(rate, steps[long], usual)[:, None]
         words.append(
-            f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
-            "each according to the change of the rate in that time"
+            f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, the longest {steps.max():.3g} s after "
+            f"{recording.time[np.argmax(steps)]:.3f} s; σ grows over each according to the change of the rate in that time"
         )
     return Faults(recording=corrected(recording, **changes), turn_variance=variance, words=tuple(words))
 

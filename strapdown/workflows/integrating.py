@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import coning, quaternion, recordings
-from strapdown.ahrs.remarks import gap_words
 from strapdown.checks import Array, InputError, instance
 from strapdown.recordings import Recording
 from strapdown.records import Estimate, ImuRecord, Origin
@@ -67,8 +66,10 @@ def integrate(
     if known is not None:
         remarks.append(_error_words(known[:: rule.samples][: len(attitude)], attitude))
     if isinstance(source, Recording):
-        gaps = gap_words(recordings.gaps(source.time))
-        remarks += [f"{gaps}: the rotation during a gap is interpolated."] if gaps else []
+        if gaps := recordings.gaps(source.time):
+            begin, length = max(gaps, key=lambda gap: gap[1])
+            longest = f"the longest {length:.3g} s after {begin:.3f} s"
+            remarks.append(f"Gaps between stamps: {len(gaps)}, {longest}: the rotation during a gap is interpolated.")
         remarks += [*source.remarks, source.left_out_words]
     return Estimate(
         time=steps,
