@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from measured import EVERY_KIND, record_of, resting, sample, series_of
 
+import strapdown as sd
 from strapdown import estimation, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import LiveFilter, error_states, filters, multiple_model, setup
@@ -328,6 +329,15 @@ TABLE = [
     (changed_setup, {"sigma": {"star": (1e-4, 0.0, 1e-4)}}, "greater than zero"),
     (changed_setup, {"integration": "four-sample"}, "integration is"),
     (changed_setup, {"process_noise": 1e-4}, "process_noise is"),
+    (sd.covariance_analysis, {"scenario": "spin", "setup": "mine"}, "setup is 'mine', not of class FilterSetup"),
+    (sd.covariance_analysis, {"scenario": "spin", "consider": {"scale_factor": 1e-4}}, "not of class Consider"),
+    (sd.monte_carlo, {"scenario": "spin", "dispersions": {"bias_sigma": 1.0}}, "not of class Dispersions"),
+    (lambda: replace(scenarios.load_scenario("spin"), gyro=1e-4), {}, "gyro is 0.0001, not of class GyroSpec"),
+    (
+        sd.tune,
+        {"sources": RECORD, "setup": SETUP, "free": "gyro.arw"},
+        "free is 'gyro.arw', not of class list or tuple",
+    ),
     (
         lambda: FilterSetup.for_scenario(replace(scenarios.load_scenario("coning"), gyro=GyroSpec()), states=False),
         {},

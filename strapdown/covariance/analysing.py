@@ -24,7 +24,7 @@ from strapdown.covariance.result import LARGEST_LINEAR, Analysis
 from strapdown.covariance.trajectory import Trajectory, noise_of, trajectory_of, unit_of
 from strapdown.estimation import forward
 from strapdown.estimation.schedule import Schedule
-from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.kernels import analysis
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
@@ -86,6 +86,7 @@ def analyse(
     scenario = scenarios.as_scenario(scenario)
     setup = FilterSetup.for_scenario(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
+    need_setup(setup)
     check_considered(scenario, consider)
     attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
     bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strapdown import vectors
-from strapdown.checks import InputError, known_keys, non_negative, one_of
+from strapdown.checks import InputError, instance, known_keys, non_negative, one_of
 from strapdown.results import ByValue
 from strapdown.scenarios import Scenario
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
@@ -69,6 +69,7 @@ class Consider(ByValue):
 
 def check_considered(scenario: Scenario, consider: Consider) -> None:
     """Raise if the scenario cannot have a considered error."""
+    instance("consider", consider, Consider, "give covariance.Consider(scale_factor=3e-4, …), SI")
     names = [sensor.name for sensor in scenario.sensors]
     for part in ("sensor_bias", "mounting", "time_offset"):
         known_keys(f"consider: {part}", getattr(consider, part), names)

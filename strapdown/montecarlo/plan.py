@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, InputError, array, count, non_negative
+from strapdown.checks import Array, InputError, array, count, instance, non_negative
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
@@ -154,6 +154,9 @@ class Plan:
         for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
             object.__setattr__(self, name, count(name, getattr(self, name), minimum=least))
         need_setup(self.setup)
+        instance(
+            "dispersions", self.dispersions, Dispersions, "give montecarlo.Dispersions(attitude_sigma=0.01, …), SI"
+        )
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
                 f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import vectors
-from strapdown.checks import Array, InputError, array, count, finite, positive
+from strapdown.checks import Array, InputError, array, count, finite, instance, positive
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Motion
 from strapdown.vectors import Sensor
@@ -117,6 +117,7 @@ class Scenario:
             raise InputError(
                 f"name is {self.name!r}, which is used in file names: leave out slashes, line breaks and leading dots"
             )
+        instance("gyro", self.gyro, GyroSpec, "give the specification of a gyro")
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         names = [sensor.name for sensor in self.sensors]
