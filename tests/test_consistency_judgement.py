@@ -13,7 +13,7 @@ from two_stars import stars
 
 from strapdown import consistency, montecarlo, motion, scenarios
 from strapdown.checks import InputError
-from strapdown.consistency.judgement import Finding, holm
+from strapdown.consistency.judgement import Finding, Part, _of_parts, holm
 from strapdown.estimation import ProcessNoise, setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
@@ -198,6 +198,11 @@ def test_a_truth_at_other_times_and_a_level_of_zero_are_refused():
 def test_holm_steps_down(p_values, rejected):
     """0.01 ≤ 0.05/3, then 0.02 ≤ 0.05/2 and 0.03 > 0.05/2, then 0.04 ≤ 0.05."""
     assert holm(p_values, 0.05) == rejected
+
+
+def test_a_power_just_beyond_the_limit_is_not_said_to_be_the_limit():
+    part = Part(of="attitude", detectable_error=1.517, why="")
+    assert "only an error of σ of ×1.52 or more is detectable" in _of_parts([part], 1.5, "60 runs", "")[1]
 
 
 def test_a_sigma_wrong_by_the_power_stated_is_found():

@@ -232,6 +232,7 @@ def test_vectors_of_a_record_are_at_their_stamps():
     np.testing.assert_array_equal(recording.specific_force, [g, none, none, 3.0 * g])
     assert recording.magnetic_field is None
     assert "Left out: magnetometer (direction)." in " ".join(recording.remarks)
+    assert "only whole vectors of sensors named accelerometer and magnetometer" in " ".join(recording.remarks)
 
 
 def test_the_magnetometer_of_a_simulated_record_is_in_tesla(tmp_path):
@@ -347,6 +348,7 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
         ("empty.csv", b"", ("is empty", "time,gx")),
         ("binary.csv", bytes(range(256)) * 8, ()),
         ("walk.mat", b"\0" * 100, ("extension '.mat'", ".csv")),
+        ("flight.toml", b"rate_hz = 100.0\n", ("extension '.toml'", ".csv")),
         ("walk.h5", b"time,gx", ("cannot be read as HDF5", "of another kind")),
     ],
 )

@@ -67,6 +67,7 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
     assert filter_setup.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.3)
     assert filter_setup.sigma["star 2"] == pytest.approx(2e-4, rel=0.2)
     content = json.loads(out.with_suffix(".json").read_text())
+    assert "standard_error: relative" in content["units"]
     names = [parameter["name"] for parameter in content["parameters"]]
     assert names == ["gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma"]
     assert content["innovations_fit"]

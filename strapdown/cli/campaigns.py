@@ -57,7 +57,7 @@ def montecarlo(
     scenario: str = Argument(help=f"{SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
     model: _Model,
     computing: _Computing,
-    out: Path | None = Option(None, help="HDF5 file. Default: NAME-montecarlo.h5 with the name of the scenario."),
+    out: Path | None = Option(None, help="HDF5 file. Default: NAME-montecarlo.h5, of the scenario or TOML file."),
     replay: int | None = Option(None, help="Repeat this run and write its record and estimate."),
 ) -> dict[str, Any] | None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""

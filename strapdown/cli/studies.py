@@ -116,7 +116,7 @@ def integrate(
 @ui.command("tables", "json")
 def coning_budget(
     *,
-    psd: Path = Option(help="CSV of vibration lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg]."),
+    psd: Path = Option(help="CSV of lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg; default: a cone]."),
     rate: list[float] = Option(help="Sample rate of the gyro, Hz; may be given several times."),
     algorithm: list[str] | None = Option(None, help="Algorithm; may be given several times."),
 ) -> dict[str, Any]:

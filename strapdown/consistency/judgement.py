@@ -587,7 +587,7 @@ def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> 
         return ("consistent", f"{_named(tested, parts)}{powers}") if tested else ("cannot tell", "no σ was tested")
     reasons: dict[str, list[Part]] = {}
     for other in others:
-        coarse = f"only an error of σ of ×{other.detectable_error:.2g} or more is detectable"
+        coarse = f"only an error of σ of ×{other.detectable_error:.3g} or more is detectable"
         reasons.setdefault(
             other.why or (coarse if math.isfinite(other.detectable_error) else "too few samples"), []
         ).append(other)

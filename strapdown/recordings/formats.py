@@ -148,7 +148,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
             f"{path} is a folder; name the file in it (folders that can be read: a ROS 2 bag, or EuRoC with imu0/data.csv)"
         )
     recognised += [candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings]
-    if table.recognised(file, head):
+    if table.recognised(file, head) and file.suffix.lower() != ".toml":
         recognised.append(table)
     if recognised:
         return recognised[0]
@@ -280,7 +280,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     remarks = ["Simulated record: the rate at each time stamp is the mean over the sample interval before it."]
     if left_out:
         remarks.append(
-            f"Left out: {', '.join(left_out)}. Recordings store only whole vectors of an accelerometer and a magnetometer."
+            f"Left out: {', '.join(left_out)}. A recording has only whole vectors of sensors named accelerometer and magnetometer."
         )
     return with_gyro(
         source=source,
