@@ -218,5 +218,8 @@ def test_missing_and_outside_measurements_are_counted():
     result = estimation.run(holed, NOISE, off(record))
     assert result.skipped == {"a": 4}
     assert len(result.innovations["a"].time) == len(series.time) - 4
+    late = replace(record, vectors=(replace(series, time=series.time + 1000.0),))
+    counted = f"a: 0 measurements, {len(series.time)} more missing or outside the record, none used"
+    assert counted in str(estimation.run(late, NOISE, off(record)))
     short = replace(records.cut(record, 0, 100), vectors=record.vectors)
     assert estimation.run(short, NOISE, off(record)).skipped["a"] == int(np.sum(series.time > 1.0))

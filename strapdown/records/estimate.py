@@ -293,14 +293,14 @@ class Estimate(ByValue, Listed):
                 rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, innovations in self.innovations.items():
-            if np.any(innovations.used):
-                nis = np.mean(innovations.nis[innovations.used]) / innovations.innovation.shape[1]
-                gate = f", {innovations.refused} rejected by the gate" if innovations.refused else ""
-                missing = self.skipped.get(sensor)
-                unused = f", {missing} more missing or outside the record" if missing else ""
-                notes.append(
-                    f"{sensor}: {len(innovations.time)} measurements{gate}{unused}, mean NIS per degree of freedom {figure(nis, 3)}"
-                )
+            used = innovations.used
+            nis = "none used"
+            if used.any():
+                mean = np.mean(innovations.nis[used]) / innovations.innovation.shape[1]
+                nis = f"mean NIS per degree of freedom {figure(mean, 3)}"
+            gate = f", {innovations.refused} rejected by the gate" if innovations.refused else ""
+            unused = f", {number} more missing or outside the record" if (number := self.skipped.get(sensor)) else ""
+            notes.append(f"{sensor}: {len(innovations.time)} measurements{gate}{unused}, {nis}")
         return Table(
             f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
             ("state", "unit", "at the end", Column("σ", digits=3), Column("σ at the start", digits=3)),
