@@ -105,7 +105,7 @@ def _diagnosed(held: Any, record: Path, judgement: Any) -> tuple[dict[str, Any],
 
     source = read_record(record)
     missing = unmodelled_errors(source.origin, held.setup)
-    ui.say(*no_state_words(missing, held.setup))
+    ui.say(*no_state_words(source.origin, held.setup))
     with ui.progress_bar("searching for causes"), reading.from_file(record):
         causes, reason = sd.diagnose(held, source, judgement=judgement)
     if causes is None:

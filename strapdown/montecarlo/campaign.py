@@ -137,7 +137,8 @@ class Campaign(Listed):
         words = [f"{self.extent}, computed in {self.seconds:.3g} s.", judgement.words]
         if judgement.verdict == "cannot tell":
             words.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
-        if judgement.unmodelled and filter_setup.states is None and filter_setup.estimator == setup.MEKF:
+        body, plain = self.plan.scenario, filter_setup.states is None and filter_setup.estimator == setup.MEKF
+        if judgement.unmodelled and plain and setup.has_states_for(body.gyro, body.sensors, body.gravity_f):
             words.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
         return words
 

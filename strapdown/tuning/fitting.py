@@ -262,7 +262,7 @@ class Tuning(Listed):
                 }
                 for parameter in self.parameters
             ],
-            "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter; standard_error: relative",
+            "units": "SI: rad, s, units of whole vectors; divide by si_per_unit for the unit of a parameter; standard_error: relative",
             "objective": {"name": measure, "before": self.before, "after": self.after},
             "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
             "innovations_fit": not self.misfit,

@@ -15,7 +15,7 @@ from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, Origin
 from strapdown.scenarios import Scenario
 from strapdown.units import STANDARD_GRAVITY
 
@@ -65,7 +65,7 @@ def filter_for_record(
         need_alone(noise, states)
         need_angles(setup, record)
         setup = dataclasses.replace(setup, **changes)
-        return setup, no_state_words(for_record.unmodelled_errors(record.origin, setup), setup)
+        return setup, no_state_words(record.origin, setup)
     if not isinstance(noise, ProcessNoise):
         return matched_filter(
             record, None if noise is None else specification_of(noise), states=states, changes=changes
@@ -115,9 +115,8 @@ def matched_filter(
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter that matches a record's specifications, with ``changes`` of its fields, and remarks on errors and their states."""
     filter_setup = dataclasses.replace(setups.FilterSetup.for_record(record, spec, states=states), **(changes or {}))
-    missing = for_record.unmodelled_errors(record.origin, filter_setup)
     if states is False or (states is None and filter_setup.states is None):
-        return filter_setup, no_state_words(missing, filter_setup)
+        return filter_setup, no_state_words(record.origin, filter_setup)
     notes = []
     if record.origin is None or record.origin.scenario is None:
         notes.append(
@@ -129,6 +128,7 @@ def matched_filter(
         notes.append(state_words(filter_setup.states.names))
     else:
         notes.append(f"Optional states: {', '.join(filter_setup.states.names)}.")
+    missing = for_record.unmodelled_errors(record.origin, filter_setup)
     return filter_setup, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
 
 
@@ -158,8 +158,11 @@ def state_words(names: Sequence[str]) -> str:
     )
 
 
-def no_state_words(missing: Sequence[str], filter_setup: FilterSetup) -> list[str]:
-    """Return a message about errors for which a filter has no state, with a remedy; empty if there are none."""
-    remedy = "" if filter_setup.states is not None else f"; {Hint('states', True)} adds states for most of them"
-    said = f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."
-    return [said] if missing else []
+def no_state_words(origin: Origin | None, filter_setup: FilterSetup) -> list[str]:
+    """Return a message about specified errors for which a filter has no state, with a remedy; empty if there are none."""
+    missing = for_record.unmodelled_errors(origin, filter_setup)
+    if origin is None or origin.gyro is None or not missing:
+        return []
+    adds = filter_setup.states is None and setups.has_states_for(origin.gyro, *setups.specified(origin))
+    remedy = f"; {Hint('states', True)} adds states for most of them" if adds else ""
+    return [f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."]

@@ -209,6 +209,20 @@ def unmodelled_errors(
     >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
     ("the gyro's scale factor of 100 ppm",)
     """
+    known = () if states is None else states.names
+    errors = _specified_errors(spec, sensors, gravity_f, rejects)
+    return tuple(words for state, words in errors if state not in known)
+
+
+def has_states_for(spec: GyroSpec, sensors: Sequence[Any], gravity_f: Sequence[float]) -> bool:
+    """Return whether there are states for any of the specified errors."""
+    return any(state for state, _ in _specified_errors(spec, sensors, gravity_f, False))
+
+
+def _specified_errors(
+    spec: GyroSpec, sensors: Sequence[Any], gravity_f: Sequence[float], rejects: bool
+) -> list[tuple[str, str]]:
+    """Return the name of the state, empty if there is none, and the words for each specified error."""
     scale, asymmetry, misalignment, flicker = (
         float(np.max(np.abs(getattr(spec, name))))
         for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability")
@@ -240,10 +254,9 @@ def unmodelled_errors(
             ),
             (accelerated, f"{name}.velocity", f"the acceleration of the point where the {name} is mounted"),
             (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
-            (not rejects and faults.outlier_probability, "", f"the outliers of the {name}"),
+            (not rejects and faults.outlier_probability, "", f"the outliers of the {name} (a gate rejects them)"),
         ]
-    known = () if states is None else states.names
-    return tuple(words for size, state, words in terms if np.any(size) and state not in known)
+    return [(state, words) for size, state, words in terms if np.any(size)]
 
 
 def linear_sigma(record: ImuRecord) -> float:
