@@ -235,7 +235,7 @@ def test_bounds_are_those_that_decide():
     """The level is shared by the ten tests of the verdict, none of which rejects, and within each by its two epochs."""
     sums, epochs = scalar.run_chunk(PLAN, 0, 3), np.array([2, 4])
     judgement = sums.judge(epochs=epochs, confidence_level=0.95)
-    assert montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)["judgement"] == judgement.summary()
+    assert montecarlo.summary(sums, epochs=epochs, judgement=judgement)["judgement"] == judgement.summary()
     bounds = {(finding.name, finding.of): (finding.low, finding.high) for finding in judgement.findings}
     anees = sums.anees[epochs, 2]
     worst = sums.time[epochs[np.abs(np.log(anees)).argmax()]]

@@ -38,11 +38,7 @@ from strapdown.montecarlo.statistics import ARRAYS, Statistics, lengths_of, merg
 from strapdown.records import CONVENTIONS, put
 from strapdown.results import Listed, Table
 
-__all__ = [
-    "Campaign",
-    "read",
-    "run",
-]
+__all__ = ["Campaign", "read", "run"]
 
 KIND = "strapdown montecarlo"
 """The attribute ``kind`` of a campaign's file."""
@@ -100,26 +96,20 @@ class Campaign(Listed):
             return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
-    def summary(self, judgement: Judgement | None = None) -> dict[str, Any]:
-        """Return plan, provenance, verdict and statistics as plain values for JSON.
+    def summary(self, judgement: Judgement) -> dict[str, Any]:
+        """Return plan, provenance, verdict and statistics of the finished runs as plain values for JSON.
 
         Parameters
         ----------
-        judgement : Judgement, optional
-            Verdict, if known. Default: that of :meth:`Statistics.judge`.
+        judgement : Judgement
+            Verdict on them.
 
         Returns
         -------
         dict
-            Plan with its digest, engine, chunk size, version and time; if runs are finished, also what
-            :func:`strapdown.montecarlo.summary` returns.
+            Plan with its digest, engine, chunk size, version and time, and what :func:`strapdown.montecarlo.summary` returns.
         """
-        statistics = self.statistics
-        own = (
-            {}
-            if statistics is None
-            else verdicts.summary(statistics, judgement=judgement, bound=verdicts.bound_of(self.plan))
-        )
+        assert self.statistics is not None
         return {
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
@@ -128,7 +118,7 @@ class Campaign(Listed):
             "chunk": self.chunk,
             "version": self.version,
             "seconds": self.seconds,
-            **own,
+            **verdicts.summary(self.statistics, judgement=judgement, bound=verdicts.bound_of(self.plan)),
         }
 
     def words(self, judgement: Judgement) -> list[str]:
@@ -364,19 +354,13 @@ def _write(path: Path, campaign: Campaign, table: Mapping[str, Any]) -> None:
     import numba
 
     plan = campaign.plan
+    packages = {module.__name__: module.__version__ for module in (np, numba, h5py)}
     with atomic_write(path, durable=True) as temporary, whole_hdf5(temporary) as file:
         attributes = {
             "kind": KIND,
             "format": FORMAT,
             "version": campaign.version,
-            "versions": json.dumps(
-                {
-                    "python": platform.python_version(),
-                    "numpy": np.__version__,
-                    "numba": numba.__version__,
-                    "h5py": h5py.__version__,
-                }
-            ),
+            "versions": json.dumps({"python": platform.python_version(), **packages}),
             "conventions": CONVENTIONS,
             "scenario": scenarios.scenario_to_toml(plan.scenario),
             "filter": setup.to_toml(plan.setup),

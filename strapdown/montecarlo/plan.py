@@ -20,6 +20,7 @@ from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.records import Origin
 from strapdown.scenarios import Scenario
 
 
@@ -203,14 +204,8 @@ class Plan:
     @property
     def unmodelled(self) -> tuple[str, ...]:
         """Errors, in words, that the scenario specifies and the filter has no state for."""
-        scenario = self.scenario
-        return setup.unmodelled_errors(
-            scenario.gyro,
-            scenario.sensors,
-            self.setup.states,
-            gravity_f=scenario.gravity_f,
-            rejects=self.setup.rejects,
-        )
+        origin = Origin(gyro=self.scenario.gyro, scenario=self.scenario)
+        return setup.for_record.unmodelled_errors(origin, self.setup)
 
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of strings and numbers, for comparison and for :func:`from_table`.

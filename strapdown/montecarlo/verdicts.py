@@ -10,6 +10,7 @@ import numpy as np
 
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
+from strapdown.consistency import Judgement
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
@@ -47,7 +48,7 @@ def summary(
     statistics: Statistics,
     *,
     epochs: Counts | None = None,
-    judgement: consistency.Judgement | None = None,
+    judgement: Judgement | None = None,
     bound: Array | None = None,
 ) -> dict[str, Any]:
     """Return the verdict (:meth:`Statistics.judge`) and numbers: mean ANEES, coverage, errors, worst runs; units in the names.

@@ -27,10 +27,7 @@ def specification_of(noise: GyroSpec | NoiseFit) -> GyroSpec:
     """Return the specification of a gyro, which may be given as a fit of its noise."""
     if isinstance(noise, allan.NoiseFit):
         return GyroSpec(**allan.to_gyro_parameters(noise))  # type: ignore[arg-type]
-    if not isinstance(noise, GyroSpec):
-        raise InputError(
-            f"noise is {type(noise).__name__}; give a GyroSpec or a NoiseFit, for an estimate also a ProcessNoise"
-        )
+    instance("noise", noise, GyroSpec, "give a GyroSpec or a NoiseFit, for an estimate also a ProcessNoise")
     return noise
 
 

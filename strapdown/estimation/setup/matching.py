@@ -247,11 +247,7 @@ def _specified_errors(
             (getattr(sensor, "hard_iron", 0.0), f"{name}.bias", f"the hard iron of the {name}"),
             (getattr(sensor, "soft_iron", 0.0), "", f"the soft iron of the {name}"),
             (getattr(sensor, "bias", 0.0), f"{name}.bias", f"the bias of the {name}"),
-            (
-                getattr(sensor, "lever_arm_b", 0.0),
-                f"{name}.lever",
-                f"the accelerations of the {name} at its lever arm",
-            ),
+            (getattr(sensor, "lever_arm_b", 0.0), f"{name}.lever", f"the accelerations of the {name} at its lever arm"),
             (accelerated, f"{name}.velocity", f"the acceleration of the point where the {name} is mounted"),
             (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
             (not rejects and faults.outlier_probability, "", f"the outliers of the {name} (a gate rejects them)"),

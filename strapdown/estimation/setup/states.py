@@ -42,12 +42,7 @@ def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entrie
     return tuple(tuple(row) if isinstance(row, list) else row for row in rows)
 
 
-VELOCITY = {
-    "velocity_time": "s",
-    "velocity_sigma": "m/s",
-    "acceleration_time": "s",
-    "position_time": "s",
-}
+VELOCITY = {"velocity_time": "s", "velocity_sigma": "m/s", "acceleration_time": "s", "position_time": "s"}
 """Fields of :class:`SensorStates` for a bounded velocity, and their units."""
 
 
@@ -330,10 +325,7 @@ def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names:
 
 # ------------------------------------------------------------------------------------------------------------------------- files
 
-_FORCE: tables.Choice = (
-    ("deg_per_hour_per_g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY),
-    ("rad_s_per_m", 1.0),
-)
+_FORCE: tables.Choice = (("deg_per_hour_per_g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY), ("rad_s_per_m", 1.0))
 _SPEED: tables.Choice = (("m_per_s", 1.0),)
 FORM: tables.Form = {
     "gyro_scale_sigma": tables.PPM,
@@ -341,10 +333,7 @@ FORM: tables.Form = {
     "gyro_symmetric": tables.FLAG,
     "gyro_force_sigma": _FORCE,
     "gyro_cross_force_sigma": _FORCE,
-    "gyro_temperature_sigma": (
-        ("deg_per_hour_per_kelvin", units.DEGREE_PER_HOUR),
-        ("rad_per_s_per_kelvin", 1.0),
-    ),
+    "gyro_temperature_sigma": (("deg_per_hour_per_kelvin", units.DEGREE_PER_HOUR), ("rad_per_s_per_kelvin", 1.0)),
     "gyro_drift_sigma": tables.DEGREES_PER_HOUR,
     "gyro_drift_time": tables.SECONDS,
     "gyro_fast_bias_sigma": tables.DEGREES_PER_HOUR,
