@@ -439,6 +439,10 @@ def test_states_of_a_direction_are_printed_relative_to_its_vector(record):
         ("a bias x", "% of the vector", "2", "1"),
         ("c bias x", "dimensionless", "0.02", "0.01"),
     ]
+    coloured = setup.SensorStates(bias_sigma=1e-7, correlated_sigma=1e-8, correlation_time=10.0)
+    for kind, unit in (("direction", "1"), ("vector", "unit of the reference")):
+        blocks = setup.States(sensors={"c": coloured}).blocks({"c": kind})
+        assert [block.units for block in blocks] == [(unit,) * 3] * 2
 
 
 # ---------------------------------------------------------------------------------------------------- a recording of a hand

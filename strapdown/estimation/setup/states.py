@@ -123,12 +123,13 @@ class SensorStates:
         """Return the error states of a sensor whose measurements are of this kind; a direction's specific force is divided by gravity."""
         one_of(f"{sensor}: kind", kind, KINDS)
         strength = 1.0 if kind == "vector" else gravity
+        # Only beside a velocity is the vector known to be a specific force.
+        own = "m/s²" if self.velocity_time > 0.0 else "unit of the reference"
+        unit = own if kind == "vector" else "1"
         blocks: list[ErrorStates] = []
         if np.any(self.mounting_sigma):
             blocks.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
         if np.any(self.bias_sigma):
-            # Only beside a velocity is the vector known to be a specific force.
-            unit = "m/s²" if kind == "vector" and self.velocity_time > 0.0 else "1"
             bias_sigma = np.asarray(self.bias_sigma)
             blocks.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
         if np.any(self.lever_arm_sigma):
@@ -141,6 +142,7 @@ class SensorStates:
                     correlation_time=self.correlation_time,
                     frame=self.frame,
                     varying=self.varying,
+                    unit=unit,
                 )
             )
         if self.velocity_time > 0.0:
