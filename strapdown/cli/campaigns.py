@@ -61,7 +61,7 @@ def montecarlo(
     replay: int | None = Option(None, help="Repeat this run and write its record and estimate."),
 ) -> dict[str, Any] | None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
-    from strapdown.montecarlo import verdicts
+    from strapdown.montecarlo import campaign, verdicts
 
     source = Path(scenario)
     held, plan = _planned(source, scenario, model)
@@ -83,7 +83,7 @@ def montecarlo(
     ui.show((judgement := sd.check(result)).listing(), title=ui.EVIDENCE)
     content = result.summary(judgement)
     ui.show(*verdicts.tables(content))
-    ui.say("Use --replay to examine a run.", *result.words(judgement))
+    ui.say("Use --replay to examine a run.", *campaign.words(result, judgement))
     if new:
         write_json(beside, content)
         ui.written(target, beside)

@@ -121,17 +121,6 @@ class Campaign(Listed):
             **verdicts.summary(self.statistics, judgement=judgement, bound=verdicts.bound_of(self.plan)),
         }
 
-    def words(self, judgement: Judgement) -> list[str]:
-        """Return extent, verdict, and what would make it clearer."""
-        filter_setup = self.plan.setup
-        words = [f"{self.extent}, computed in {self.seconds:.3g} s.", judgement.words]
-        if judgement.verdict == "cannot tell":
-            words.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
-        body, plain = self.plan.scenario, filter_setup.states is None and filter_setup.estimator == setup.MEKF
-        if judgement.unmodelled and plain and setup.has_states_for(body.gyro, body.sensors, body.gravity_f):
-            words.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
-        return words
-
     @property
     def extent(self) -> str:
         """Numbers of runs, seed and machine, in words."""
@@ -148,6 +137,18 @@ class Campaign(Listed):
     def finished(self) -> bool:
         """Whether the statistics contain all runs."""
         return self.finished_runs == self.runs
+
+
+def words(campaign: Campaign, judgement: Judgement) -> list[str]:
+    """Return extent and verdict of a campaign, and what would make the verdict clearer."""
+    body, own = campaign.plan.scenario, campaign.plan.setup
+    sentences = [f"{campaign.extent}, computed in {campaign.seconds:.3g} s.", judgement.words]
+    if judgement.verdict == "cannot tell":
+        sentences.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
+    plain = own.states is None and own.estimator == setup.MEKF
+    if judgement.unmodelled and plain and setup.has_states_for(body.gyro, body.sensors, body.gravity_f):
+        sentences.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
+    return sentences
 
 
 def with_filter(held: Campaign, own: Own, path: Path) -> Campaign:

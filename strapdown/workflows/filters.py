@@ -77,10 +77,7 @@ def filter_for_record(
         )
     sigma = np.sqrt(np.diag(initial.covariance))
     return FilterSetup(
-        process_noise=noise,
-        attitude_sigma=float(np.max(sigma[:3])),
-        bias_sigma=float(np.max(sigma[3:6])),
-        **changes,
+        process_noise=noise, attitude_sigma=float(np.max(sigma[:3])), bias_sigma=float(np.max(sigma[3:6])), **changes
     ), []
 
 
