@@ -501,6 +501,10 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
         return original(plans, first_run, runs)
 
     before = signal.getsignal(signal.SIGTERM)
+    with monkeypatch.context() as at_once:
+        at_once.setattr(campaign, "choose", lambda *_: signal.raise_signal(signal.SIGINT))
+        status, said, _ = command("short.toml", "--runs", 60, *SCALAR)
+    assert (status, "--resume" in said) == (130, False)  # nothing is written yet
     monkeypatch.setattr(scalar, "run_chunks", interrupted)
     status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
     assert status == 130

@@ -148,7 +148,7 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
         try:
             return campaigns.run(plan, target, runs=runs, workers=workers, progress=advance, **how)
         except KeyboardInterrupt:
-            ui.say(f"The completed runs are in {target}; continue with --resume.")
+            ui.say(f"The completed runs are in {target}; continue with --resume." if target.exists() else "")
             raise
 
 
