@@ -20,7 +20,7 @@ from measured import errors_at
 from spin_plan import PLAN, SCENARIO, SETUP, assert_same
 
 import strapdown as sd
-from strapdown import montecarlo, records, scenarios
+from strapdown import coning, montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.files import locked, reading
@@ -344,6 +344,16 @@ def test_the_command_computes_prints_and_writes(command, monkeypatch):
     assert {name: report[name] for name in expected} == json.loads(json.dumps(expected))
     assert held.plan.seed == 4
     assert held.plan.epochs == 80
+
+
+def test_drift_by_coning_is_named_where_the_filter_is_not_consistent(command):
+    status, said, _ = command("coning", "--runs", 100, "--no-states")
+    assert status == 1
+    assert "One-sample integration drifts in this motion (coning)" in " ".join(said.split())
+    matched = setups.FilterSetup.for_scenario(scenarios.load_scenario("coning"), states=False)
+    accurate = replace(matched, integration=coning.ALGORITHMS["matched-1-8-8"])
+    Path("accurate.toml").write_text(setups.to_toml(accurate), encoding="utf-8")
+    assert "One-sample" not in command("coning", "--runs", 100, "--filter", "accurate.toml", "--out", "other.h5")[1]
 
 
 def test_the_command_matches_the_filter_to_a_data_sheet(command):

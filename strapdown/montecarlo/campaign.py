@@ -148,6 +148,13 @@ def words(campaign: Campaign, judgement: Judgement) -> list[str]:
     plain = own.states is None and own.estimator == setup.MEKF
     if judgement.unmodelled and plain and setup.has_states_for(body.gyro, body.sensors, body.gravity_f):
         sentences.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
+    one_sample = own.estimator == setup.MEKF and own.integration.name == "one-sample"
+    drifts = one_sample and setup.commutes_badly(scenarios.simulate(body), own.process_noise.angle_random_walk)
+    if drifts and judgement.verdict != "consistent":
+        sentences.append(
+            "One-sample integration drifts in this motion (coning) by more than the gyro's noise explains; give a filter with another "
+            "integration, such as matched-1-8-8."
+        )
     return sentences
 
 

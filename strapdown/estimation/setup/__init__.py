@@ -24,6 +24,7 @@ from strapdown.estimation.setup.filter_setup import FilterSetup
 from strapdown.estimation.setup.filter_setup import need_angles as need_angles
 from strapdown.estimation.setup.filter_setup import need_mekf as need_mekf
 from strapdown.estimation.setup.filter_setup import need_setup as need_setup
+from strapdown.estimation.setup.matching import commutes_badly as commutes_badly
 from strapdown.estimation.setup.matching import has_states_for as has_states_for
 from strapdown.estimation.setup.matching import specified as specified
 from strapdown.estimation.setup.matching import unmodelled_errors as unmodelled_errors
