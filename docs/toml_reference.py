@@ -29,7 +29,8 @@ def _section(section: Section) -> str:
     rows = ["| key | unit | value | default | meaning |", "|---|---|---|---|---|"]
     for key in section.keys:
         names = "<br>or ".join(_broken(name) for name in (key.name, *key.others))
-        rows.append(f"| {names} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
+        meaning = key.meaning.replace("|", "\\|")
+        rows.append(f"| {names} | {key.unit} | {key.type} | {key.default} | {meaning} |")
     return "\n".join([head, "", *(rows if section.keys else [])])
 
 

@@ -147,10 +147,12 @@ def test_every_kind_of_measurement_that_a_meaning_names_is_accepted():
 
 
 def test_the_keys_are_printed_by_section():
-    for name, words in (("coning", "frequency_hz = 1.0"), ("gyro", "# angle_random_walk_deg_per_sqrt_hour = 0.0")):
+    gyro = ("# angle_random_walk_deg_per_sqrt_hour = 0.0", "default zeros. Constant bias, body axes.", "a |w|")
+    for name, *words in (("coning", "frequency_hz = 1.0"), ("gyro", *gyro), ("horizon", "Name of the sensor")):
         result = CliRunner().invoke(app, ["keys", name])
         assert result.exit_code == 0, result.output
-        assert words in result.output
+        assert all(word in result.output for word in words)
+        assert max(map(len, result.output.splitlines())) <= 88
     every = CliRunner().invoke(app, ["keys"]).output
     assert all(section.header in every for section in SECTIONS)
     with pytest.raises(InputError, match=r"no section 'gyros' .* name one of top, motion, gyro, sensors"):

@@ -32,10 +32,10 @@ def keys(
     from strapdown.scenarios import keys as reference
 
     if section is None:
-        ui.say(*(reference.listing(part).title for part in reference.sections()))
+        ui.say(*map(reference.heading, reference.sections()))
         ui.say("The keys of one section: strapdown keys SECTION, such as gyro or coning.")
     else:
-        ui.show(*map(reference.listing, reference.named(section)))
+        ui.say(*map(reference.described, reference.named(section)))
 
 
 @ui.command()

@@ -71,7 +71,7 @@ class GyroSpec(ByValue):
     angle_random_walk : float or ndarray (3,), default 0.0
         Angle random walk σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
     rate_random_walk : float or ndarray (3,), default 0.0
-        Rate random walk σ_u (K), rad/s/√s, of the bias, from 0 at the first edge.
+        Rate random walk σ_u (K) of the bias, rad/s/√s, from 0 at the first edge.
     bias_instability : float or ndarray (3,), default 0.0
         Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of
         the Allan deviation is 0.664 B.
@@ -80,7 +80,7 @@ class GyroSpec(ByValue):
     rate_ramp : float or ndarray (3,), default 0.0
         Rate ramp R, rad/s²: slope of the bias, which starts at 0 at the first edge.
     markov_noise : float or ndarray (3,), default 0.0
-        Noise √q, rad/s/√s, that drives a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
+        Noise √q, rad/s/√s: it drives a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
     markov_correlation_time : float, default inf
         Correlation time τ of that bias, s; stationary from the start if finite, a random walk from 0 if infinite.
     turn_on_bias : ndarray (3,), default zeros

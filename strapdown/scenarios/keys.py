@@ -8,6 +8,7 @@ import inspect
 import json
 import math
 import re
+import textwrap
 import typing
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -19,7 +20,7 @@ from strapdown.checks import InputError
 from strapdown.files import tables
 from strapdown.gyro import datasheets
 from strapdown.motion import orbit
-from strapdown.results import Table
+from strapdown.results import WIDTH
 from strapdown.scenarios import toml
 from strapdown.scenarios.scenario import Scenario, Temperature
 
@@ -100,18 +101,20 @@ def _names(header: str) -> tuple[str, str]:
     return name, name.rpartition(".")[2]
 
 
-def listing(section: Section) -> Table:
-    """Return the keys of a section as a table, with an example as its note."""
-    plain = lambda text: text.replace("`", "")  # noqa: E731
-    rows = [
-        (" or ".join((key.name, *key.others)), key.unit, key.type, plain(key.default), plain(key.meaning))
-        for key in section.keys
-    ]
-    title = section.header + (f', type = "{section.type}"' if section.type else "")
-    notes = [f"Example:\n{example(section)}"] if rows else []
-    return Table(
-        f"{title}: {plain(section.summary)}", ("key", "unit", "value", "default", "meaning"), rows, notes, left=5
-    )
+def heading(section: Section) -> str:
+    """Return the header of a section and its summary in one line."""
+    kind = f', type = "{section.type}"' if section.type else ""
+    return f"{section.header}{kind}: {re.sub('[`*]', '', section.summary)}"
+
+
+def described(section: Section) -> str:
+    """Return the heading of a section, its keys, and an example as text."""
+    lines = textwrap.wrap(heading(section), WIDTH)
+    for key in section.keys:
+        default = key.default if key.default == "required" else f"default {key.default}"
+        words = f"{', '.join(filter(None, (key.unit, key.type, default)))}. {key.meaning}".replace("`", "")
+        lines += [" or ".join((key.name, *key.others)), textwrap.indent(textwrap.fill(words, WIDTH - 4), "    ")]
+    return "\n".join([*lines, *(["", f"Example:\n{example(section)}"] if section.keys else []), ""])
 
 
 def example(section: Section) -> str:
@@ -172,7 +175,9 @@ def _gyro() -> Section:
 
 
 def _keys(kind: type, form: tables.Form) -> tuple[Key, ...]:
-    meanings, hints = _meanings(kind), typing.get_type_hints(kind, localns={"CircularOrbit": orbit.CircularOrbit})
+    own = {name: text for name, text in _meanings(kind).items() if not text.startswith("As for")}
+    meanings = _meanings(vectors.VectorSensor) | own
+    hints = typing.get_type_hints(kind, localns={"CircularOrbit": orbit.CircularOrbit})
     fields = {field.name: field for field in dataclasses.fields(kind)}
     return tuple(_key(fields[name], hints[name], choice, meanings.get(name, "")) for name, choice in form.items())
 
@@ -180,6 +185,8 @@ def _keys(kind: type, form: tables.Form) -> tuple[Key, ...]:
 def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meaning: str) -> Key:
     names = [f"{field.name}_{suffix}" if suffix else field.name for suffix, _ in choice]
     suffix, factor = choice[0]
+    if si := symbol(choice[-1][0]):  # the unit of the field, which is not that of every key
+        meaning = re.sub(rf", {re.escape(si)}(?![\w/√²])", "", meaning, count=1)
     default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
     kind = _type(hint, default)
     if default is dataclasses.MISSING:
@@ -239,6 +246,6 @@ def _meanings(kind: type) -> dict[str, str]:
         r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S+\n-+\n|\Z)", inspect.getdoc(kind) or "", re.M | re.S
     ):
         for names, text in re.findall(r"^(\S[^:\n]*?) ?:.*\n((?:[ \n].*\n?)*)", part + "\n", re.M):
-            plain = " ".join(re.sub(r":\w+:`", "`", text).split()).replace("``", "`").replace("|", "\\|")
+            plain = " ".join(re.sub(r":\w+:`", "`", text).split()).replace("``", "`")
             said |= {name.strip(): plain for name in names.split(",")}
     return said
