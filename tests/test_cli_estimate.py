@@ -282,7 +282,7 @@ def test_the_verdict_names_what_the_filter_has_no_state_for(run, succeeds, spinn
         succeeds("estimate", spinning, "--out", tmp_path / "out", "--every", 10, *options)
         said = run("check", tmp_path / "out" / "estimate.h5")[1]
         assert (no_state in said) == missing
-        assert ("the σ of gyro scale is not tested: no truth for it" in said) == (not missing)
+        assert ("the σ of gyro scale is not tested: the truth is not known" in said) == (not missing)
     page = report.write(tmp_path / "out" / "estimate.h5").page.read_text(encoding="utf-8")
     assert no_state.replace("'", "&#x27;") in page[: page.index("<h2>")]  # in the headline
 

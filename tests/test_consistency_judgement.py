@@ -218,17 +218,17 @@ def test_a_state_that_nothing_tests_is_named():
     result, truth = with_states(["gyro.scale"])
     blind = consistency.judge(result)
     assert blind.headline.startswith(
-        "cannot tell: innovations consistent; attitude and bias not testable from this run: no truth for it; detectable error of σ: "
+        "cannot tell: innovations consistent; attitude and bias not testable from this run: the truth is not known; detectable error of σ: "
     )
     assert all(math.isinf(part.detectable_error) for part in blind.parts if not part.of.startswith("innovations"))
-    assert any("the σ of gyro.scale is not tested: no truth for it" in limit for limit in blind.limits)
+    assert any("the σ of gyro.scale is not tested: the truth is not known" in limit for limit in blind.limits)
     spec = GyroSpec(angle_random_walk=1e-5, asymmetry=(9e-6, 0.0, 0.0))
     noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
     setup = FilterSetup(process_noise=noise, bias_sigma=1e-3)
     judgement = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
     assert judgement.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
     plain = json.loads(json.dumps(blind.summary(), allow_nan=False))["parts"]
-    assert plain[-1] == {"of": "bias", "detectable_error": None, "why": "no truth for it"}
+    assert plain[-1] == {"of": "bias", "detectable_error": None, "why": "the truth is not known"}
 
 
 def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
@@ -238,7 +238,7 @@ def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
         assert judged.verdict == status
         assert {finding.name for finding in judged.findings} == {"NIS"}
     judged = consistency.judge(of_a_recording(estimate(0.1)[0]))
-    assert "innovations within σ; attitude and bias not testable from this run: no truth for it" in judged.reason
+    assert "innovations within σ; attitude and bias not testable from this run: the truth is not known" in judged.reason
     assert "RMS over σ: innovations of star 1 0.1" in judged.reason
     small, truth = estimate(0.1)
     small = consistency.judge(of_a_recording(small), truth)

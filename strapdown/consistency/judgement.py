@@ -45,7 +45,7 @@ DETECTABLE = 1.5
 
 STATES = ("attitude", "bias")
 """States of a filter whose σ are tested."""
-NO_TRUTH = "no truth for it"
+NO_TRUTH = "the truth is not known"
 """Reason why a part of a result is not tested."""
 NO_COVARIANCE = "no covariance"
 """Another one."""
@@ -327,7 +327,7 @@ def judge(
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         names = tuple(estimate.error_states)
-        limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: no truth for it")
+        limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: {NO_TRUTH}")
     judged = concluded(
         _one_sided(findings) if estimate.motion else findings,
         limits,
