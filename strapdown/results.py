@@ -37,7 +37,7 @@ class Column(NamedTuple):
     """A column of a :class:`Table`."""
 
     label: str | None
-    """Heading in text; None: the column is in files only."""
+    """Heading in text, ``quantity`` or ``quantity, unit``; None: the column is in files only."""
     key: str | None = None
     """Heading in CSV, a name with the unit; None: the column is in text only."""
     digits: int = 4
@@ -104,12 +104,13 @@ class Table:
 
     @property
     def lines(self) -> list[str]:
-        """Heading, rule and rows as lines of text; none without rows."""
-        cells, marks = [self.head, *self.cells], ["<" if side == "left" else ">" for side in self.sides]
+        """Heading, with units in a second line, rule and rows as lines of text; none without rows."""
+        heads = list(filter(any, zip(*((*label.rsplit(", ", 1), "")[:2] for label in self.head), strict=True)))
+        cells, marks = [*heads, *self.cells], ["<" if side == "left" else ">" for side in self.sides]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         layout = "  ".join(f"{{:{mark}{width}}}" for mark, width in zip(marks, widths, strict=True))
         lines = [layout.format(*row).rstrip() for row in cells]
-        return [lines[0], "-" * max(map(len, lines)), *lines[1:]] if self.rows else []
+        return [*lines[: len(heads)], "-" * max(map(len, lines)), *lines[len(heads) :]] if self.rows else []
 
     @property
     def text(self) -> str:

@@ -110,6 +110,7 @@ def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
     for name, (wrong, words) in broken(recording, seed).items():
         examination = check_conventions.examine(wrong)
         assert examination.verdict == "wrong convention", name
+        assert max(map(len, examination.listing().lines)) <= 100, name  # a terminal's
         # Without a reference a sensor inverted as a whole fits as well, and is reported beside.
         assert words in " ".join([examination.reason, *(() if reference else examination.notes)]), (
             name,

@@ -145,7 +145,7 @@ def test_a_rotation_of_two_sigma_is_a_likely_cause():
     turned = quaternion.multiply(quaternion.exp([0.0, 0.0, 2e-3]), attitude)
     explanation = check_arrays(time, turned, P, time, truth, align="none").explanations[0]
     assert explanation.likely
-    assert explanation.name.startswith("constant rotation of the fixed frame")
+    assert explanation.name.startswith("fixed frame rotated")
 
 
 def test_a_bias_held_at_zero_is_named(run):
@@ -326,12 +326,12 @@ FAULTS = {
     "late": ({"time": lambda e: e.time + 0.1, "align": "none"}, "offset of the clock, delay", [-100.0]),
     "heading": (
         {"attitude": lambda e: quaternion.multiply(HEADING, e.attitude)},
-        "constant rotation of the fixed frame (heading, gravity)",
+        "fixed frame rotated (heading, gravity)",
         [0.0, 0.0, -2.0],
     ),
     "mounting": (
         {"attitude": lambda e: quaternion.multiply(e.attitude, MOUNTING)},
-        "constant rotation of the body frame (mounting)",
+        "body frame rotated (mounting)",
         [0.0, -1.5, 0.0],
     ),
 }
@@ -347,6 +347,7 @@ def test_a_broken_filter_is_called_wrong_and_its_fault_is_named_first(run, fault
         (explanation.name, explanation.p_value, explanation.nees) for explanation in outcome.explanations
     ]
     assert outcome.explanations[0].likely
+    assert max(map(len, outcome.listing().lines)) <= 100  # a terminal's
     assert abs(np.log(outcome.explanations[0].nees)) < np.log(1.5)
     numbers = [float(number) for number in re.findall(r"[-+.\de]+(?=[,° ]|$)", outcome.explanations[0].value)]
     np.testing.assert_allclose(numbers, size, rtol=0.1, atol=0.1)

@@ -124,7 +124,7 @@ def test_every_statistic_and_cause_of_check(run, estimated):
     product = np.linalg.solve(x.T @ x, x.T @ y) @ np.linalg.solve(y.T @ y, y.T @ x)
     bartlett = -(n - 2.5) * np.log(np.linalg.det(np.eye(2) - product))
     largest = np.max(np.abs(x.T @ y / np.sqrt(np.outer(np.sum(x**2, axis=0), np.sum(y**2, axis=0)))))
-    agrees("cross-correlation", "star 1 and star 2", largest, chi2.sf(bartlett, 4))
+    agrees("cross-correlation", "star 1, star 2", largest, chi2.sf(bartlett, 4))
     for of, states in (("state", slice(0, 6)), ("attitude", slice(0, 3)), ("bias", slice(3, 6))):
         k = states.stop - states.start
         square = float(nees(error[-1:, states], covariance[-1:, states, states])[0])

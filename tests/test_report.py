@@ -360,8 +360,8 @@ def test_a_chart_of_an_angle_breaks_where_it_wraps():
     assert np.nanmax(np.abs(np.diff(data))) < 180.0
 
 
-PARENTS = {"li": "ul", "tr": "table", "td": "tr", "th": "tr", "figcaption": "figure"}
-"""Elements that stand in one other alone."""
+PARENTS = {"li": ["ul"], "tr": ["thead", "tbody"], "td": ["tr"], "th": ["tr"], "figcaption": ["figure"]}
+"""Elements that stand in these alone; a head in ``thead`` is repeated on each printed page."""
 
 
 class Tags(html.parser.HTMLParser):
@@ -376,7 +376,7 @@ class Tags(html.parser.HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         assert len({name for name, _ in attributes}) == len(attributes), f"{tag} has an attribute twice"
-        assert tag not in PARENTS or self.open[-1] == PARENTS[tag], f"{tag} stands in {self.open[-1]}"
+        assert tag not in PARENTS or self.open[-1] in PARENTS[tag], f"{tag} stands in {self.open[-1]}"
         assert not (self.open and self.open[-1] == "p" and tag in self.BLOCKS), f"{tag} stands in a paragraph"
         self.seen.append(tag)
         if tag not in self.VOID:

@@ -22,6 +22,8 @@ from strapdown.report.tables import to_csv, to_latex
 from strapdown.results import Column, Table
 
 FEW = ("--free", "star 1.sigma", "--starts", 1)
+TERMINAL = 100
+"""Maximum width of a printed table."""
 LATEX = next((path for name in ("pdflatex", "lualatex", "tectonic") if (path := shutil.which(name))), None)
 CELLS = st.one_of(
     st.none(),
@@ -95,6 +97,12 @@ def test_latex_rounds_and_aligns():
     assert body[1][1] == "$-62.39$"
 
 
+def test_a_unit_is_below_its_quantity():
+    table = Table("t", ("state", "bias, °/h"), [("x", 12.5)])
+    assert table.lines == ["state  bias", "        °/h", "-----------", "x      12.5"]
+    assert '<th class="number">bias<br>°/h</th>' in page.table(table)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Each command once, with --tables, and --format where it draws: its folder by the command's name."""
@@ -124,6 +132,7 @@ def written(tmp_path_factory):
             result = CliRunner().invoke(cli.app, [str(part) for part in [name, *options, *tables]])
         wanted = (0, 3) if name == "montecarlo" else (0,)  # so few runs cannot tell
         assert result.exit_code in wanted, (name, result.output, result.exception)
+        assert max(map(len, re.findall("^-+$", result.output, re.MULTILINE)), default=0) <= TERMINAL, name
         for path in (where / "tables" / name).glob("*"):
             assert path.name in result.output.replace("\n", "")
     return where

@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -86,6 +87,7 @@ FORCE_UNITS: dict[str, float] = {
 }
 
 NO_CHANGE = "no change"
+_WORDY = r"axes of the |the (?=ref)|'s fixed frame is| quaternions|should be read as |are |is (?=\d)| \((?:[^()]*( read as | to ).*?)?\)"
 PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
 """m₀ of relations to a reference, and of those between sensors only, which the gyro's bias disturbs. To those of the accelerometer the
@@ -115,6 +117,12 @@ def axes_words(matrix: Array) -> str:
     return ", ".join(names)
 
 
+def _brief(text: str) -> str:
+    """Return a change, or the name of a relation, without hints and in few words."""
+    brief = re.sub(_WORDY, "", Hint.replaced(text, lambda _: ""))
+    return brief.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
     """One explanation of a recording.
@@ -137,6 +145,11 @@ class Candidate:
     def words(self) -> str:
         """The changes in one line."""
         return "; ".join(self.changes) or NO_CHANGE
+
+    @property
+    def brief(self) -> str:
+        """At most two of the changes, in few words, for a row of a table."""
+        return "; ".join([*map(_brief, self.changes[:2]), *["…"] * (len(self.changes) > 2)]) or NO_CHANGE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,15 +191,9 @@ class Examination:
 
     def listing(self) -> Table:
         """Return the best explanations as a table; the hints to their remedies are in the verdict."""
-        plain_words = lambda text: Hint.replaced(text, lambda _: "").replace(" ()", "").replace("; )", ")")  # noqa: E731
-        short = lambda name: name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")  # noqa: E731
-        names = list(self.candidates[0].misfit)
         columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
-        columns += [Column(short(name), shown="{:.3f}".format) for name in names]
-        rows = [
-            (plain_words(candidate.words), candidate.score, *candidate.misfit.values())
-            for candidate in self.candidates[:8]
-        ]
+        columns += [Column(_brief(name), shown="{:.3f}".format) for name in self.candidates[0].misfit]
+        rows = [(candidate.brief, candidate.score, *candidate.misfit.values()) for candidate in self.candidates[:8]]
         title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
         return Table(title, columns, rows)
 

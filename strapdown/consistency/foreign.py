@@ -105,17 +105,8 @@ class Checked:
 
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
-        rows = [
-            (
-                explanation.name,
-                explanation.value,
-                explanation.nees,
-                explanation.p_value,
-                "likely" if explanation.likely else "no",
-            )
-            for explanation in self.explanations
-        ]
-        columns = ("cause", "size", "remaining NEES", Column("p-value", digits=2), "")
+        rows = [(e.name, e.value, e.nees, e.p_value, "likely" if e.likely else "no") for e in self.explanations]
+        columns = ("cause", "size", "NEES then", Column("p-value", digits=2), "")
         return Table("Possible causes of the attitude errors", columns, rows, left=2)
 
     def summary(self) -> dict[str, Any]:
@@ -384,8 +375,8 @@ def _constant_differences(error: Array, P: Array, derivatives: Array) -> Iterato
     """Yield constant rotations of the frames and a clock offset; ``derivatives`` (m, 3, 7) are those of the error with respect to them."""
     white, factor = whitened(error, P), np.linalg.cholesky(P)
     designs = {
-        "constant rotation of the fixed frame (heading, gravity)": derivatives[:, :, :3],
-        "constant rotation of the body frame (mounting)": derivatives[:, :, 3:6],
+        "fixed frame rotated (heading, gravity)": derivatives[:, :, :3],
+        "body frame rotated (mounting)": derivatives[:, :, 3:6],
         "offset of the clock, delay": derivatives[:, :, 6:],
     }
     for name, J in designs.items():

@@ -222,7 +222,7 @@ class Judgement(Listed):
             Column(None, "upper_bound"),
             Column(f"{100.0 * self.confidence_level:g} % bounds"),
             Column("p-value", "p_value", digits=2),
-            Column("samples", "samples"),
+            Column("samples", "samples", shown="{:.0f}".format),
             Column("", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
         )
         meaning = (
@@ -413,7 +413,7 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
         means = (
             f"innovations of {sensor} and {other} are correlated: they share an error that the filter does not model"
         )
-        of = f"{sensor} and {other}"
+        of = f"{sensor}, {other}"
         findings.append(Finding(name="cross-correlation", of=of, value=largest, p_value=p, samples=pairs, means=means))
     return findings
 

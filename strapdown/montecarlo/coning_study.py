@@ -299,13 +299,13 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     ]
     filters = [
         Column("integration", "integration"),
-        Column("attitude RMS, arcsec", "attitude_rms_arcsec"),
+        Column("attitude, arcsec", "attitude_rms_arcsec"),
         Column("σ", "attitude_sigma_arcsec"),
-        Column("bias RMS, °/h", "bias_rms_deg_per_hour"),
+        Column("bias, °/h", "bias_rms_deg_per_hour"),
         Column("σ", "bias_sigma_deg_per_hour"),
         Column("mean z, °/h", "bias_mean_z_deg_per_hour", 3),
-        Column("ANEES attitude", "anees_attitude"),
-        Column("ANEES bias", "anees_bias"),
+        Column("ANEES, attitude", "anees_attitude"),
+        Column("ANEES, bias", "anees_bias"),
         Column("NIS", "nis"),
         Column("verdict", "verdict"),
     ]
@@ -318,13 +318,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     return [
         *_own_table(summary),
         _table("Drift of the integration, °/h about the cone's axis", drifts, summary["integration"], name="drift"),
-        _table(
-            "The same filter with each algorithm: RMS error and σ of the filter",
-            filters,
-            outcomes,
-            (note,),
-            name="filters",
-        ),
+        _table("The same filter with each algorithm: RMS error and its σ", filters, outcomes, (note,), name="filters"),
     ]
 
 

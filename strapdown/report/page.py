@@ -105,15 +105,16 @@ MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
 def table(content: Table) -> str:
     """Return a table and its notes, without its title; it scrolls on a narrow page, or without numbers wraps its text."""
     kinds = [' class="number"' if side == "right" else "" for side in content.sides]
-    heads = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
-    lines = [f"<tr>{heads}</tr>"]
+    head = "".join(f"<th{kind}>{text(cell)}</th>" for kind, cell in zip(kinds, content.head, strict=True))
+    rows = []
     for row in content.cells:
         own = [f' class="{MARKS[cell]}"' if cell in MARKS else kind for kind, cell in zip(kinds, row, strict=True)]
         cells = "".join(f"<td{kind}>{prose(cell)}</td>" for kind, cell in zip(own, row, strict=True))
-        lines.append(f"<tr>{cells}</tr>")
+        rows.append(f"<tr>{cells}</tr>")
     frame = 'class="scroll" tabindex="0"' if any(kinds) else 'class="wrap"'  # the arrow keys scroll what has the focus
     notes = (paragraph(note, faint=True) for note in content.notes)
-    return "\n".join([f"<div {frame}><table>" + "\n".join(lines) + "</table></div>", *notes])
+    cells = "\n".join([f"<thead><tr>{head.replace(', ', '<br>')}</tr></thead><tbody>", *rows])
+    return "\n".join([f"<div {frame}><table>{cells}</tbody></table></div>", *notes])
 
 
 def listed(content: Table) -> str:

@@ -174,8 +174,8 @@ class Estimated:
         if self.note != NOT_IDENTIFIED:
             return self.note
         if not math.isfinite(self.upper):
-            return f"{NOT_IDENTIFIED}: these records have no information about it"
-        return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
+            return f"{NOT_IDENTIFIED}: no information in these records"
+        return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name}"
 
 
 ENDS = {"before": "before", "after": "after", "from": "lower_95", "to": "upper_95"}
