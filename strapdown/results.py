@@ -194,7 +194,7 @@ class Listed:
 
 
 def figure(value: float | None, digits: int = 4) -> str:
-    """Return a number with the given number of significant digits; a dash for None and NaN.
+    """Return a number with the given number of significant digits, without exponent up to a million; a dash for None and NaN.
 
     Examples
     --------
@@ -205,7 +205,8 @@ def figure(value: float | None, digits: int = 4) -> str:
         return "-"
     if math.isinf(value):
         return "∞" if value > 0.0 else "-∞"
-    return f"{value:.{digits}g}"
+    number = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e+" in number and abs(value) < 1e6 else number
 
 
 class ByValue:

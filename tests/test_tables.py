@@ -98,8 +98,8 @@ def test_latex_rounds_and_aligns():
 
 
 def test_a_unit_is_below_its_quantity():
-    table = Table("t", ("state", "bias, °/h"), [("x", 12.5)])
-    assert table.lines == ["state  bias", "        °/h", "-----------", "x      12.5"]
+    table = Table("t", ("state", Column("bias, °/h", digits=2)), [("x", 7200.0)])
+    assert table.lines == ["state  bias", "        °/h", "-----------", "x      7200"]
     assert '<th class="number">bias<br>°/h</th>' in page.table(table)
 
 
