@@ -42,14 +42,21 @@ def rate_unit(value: ArrayLike) -> tuple[str, float]:
     return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)
 
 
-_STATE_UNITS = {
+_STATE_UNITS: dict[str, dict[str, tuple[str, float]]] = {
+    **{f"attitude {axis}": {"rad": ("°", DEGREE)} for axis in "xyz"},
+    "gyro bias": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
     "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
     "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
     "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},
 }
 
 
+def error_state_name(block: str, component: str) -> str:
+    """Return the name of one state from those of its declaration and its component, which may begin with the same word."""
+    return f"{block} {component.removeprefix(block.rsplit(maxsplit=1)[-1]).strip()}".strip()
+
+
 def error_state_unit(name: str, unit: str) -> tuple[str, float]:
-    """Return the name and the factor to SI of the printed unit of an error state, from its name and SI unit."""
+    """Return the name and the factor to SI of the printed unit of a state, from its name and SI unit."""
     word = "dimensionless" if unit == "1" else unit
     return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit, (word, 1.0))

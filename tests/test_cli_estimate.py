@@ -256,6 +256,8 @@ def test_what_a_record_shows_of_each_state(succeeds, record, tmp_path):
     assert len(saved["states"]) == len(saved["directions"]) == len(saved["directions"][0]) == 6
     assert saved["rank"] == sum(value >= saved["threshold"] for value in saved["singular_values"])
     assert set(saved["units"]) == {"rad", "rad/s"}
+    printed = f"gyro bias x °/h {3600.0 * np.degrees(saved['prior_sigma'][3]):.3g} "
+    assert printed in " ".join(said.partition("prior σ")[2].split())
     # The next estimate replaces all of this one and nothing else.
     (tmp_path / "out" / "estimate.html").write_text("a report of the first estimate")
     (tmp_path / "out" / "notes.txt").write_text("mine")

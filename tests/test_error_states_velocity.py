@@ -20,6 +20,7 @@ from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import stationary_covariance
+from strapdown.estimation.observability import state_names
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
@@ -217,6 +218,7 @@ def test_names_units_and_strength():
     block = error_states.BoundedVelocity(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
     assert block.name == "acc velocity"
     assert block.components[:2] == ("velocity x", "drive x")
+    assert state_names([block])[0][6:8] == ("acc velocity x", "acc velocity drive x")
     assert block.units == ("m/s", "m/s²") * 3
     whole = dataclasses.replace(block, strength=1.0)
     np.testing.assert_allclose(9.80665 * block.effects["acc"].offset_f, whole.effects["acc"].offset_f, rtol=1e-14)

@@ -17,6 +17,7 @@ from strapdown.estimation.smoothing import smooth
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 from strapdown.results import Column, Listed, Table
+from strapdown.units import error_state_name, error_state_unit
 
 WEAKEST = 3
 """Minimum number of directions in text: these, and all that are not observed."""
@@ -71,22 +72,24 @@ class Observability(Listed):
 
     def listing(self) -> Table:
         """Return the σ of each state, and the weakest directions with their singular values, as a table."""
-        n, prior = len(self.states), self.prior_sigma
-        names = map(", ".join, zip(self.states, self.units, strict=True))
+        n, relative = len(self.states), self.start_sigma / self.prior_sigma
+        units, sizes = zip(*map(error_state_unit, self.states, self.units), strict=True)
         weakest = range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
         return Table(
             f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)",
             (
                 "state",
+                "unit",
                 Column("prior σ", digits=3),
                 Column("start/prior", digits=3),
                 Column("unobserved", shown="{:.2f}".format),
             ),
-            list(zip(names, prior, self.start_sigma / prior, self.unobserved, strict=True)),
+            list(zip(self.states, units, self.prior_sigma / sizes, relative, self.unobserved, strict=True)),
             [
                 "singular value: the weakest directions, each state relative to its prior σ",
                 *(f"{self.singular_values[k]:14.3g}: {self._words(k)}" for k in weakest),
             ],
+            left=2,
         )
 
     def summary(self) -> dict[str, Any]:
@@ -119,7 +122,7 @@ def state_names(blocks: Sequence[ErrorStates]) -> tuple[tuple[str, ...], tuple[s
     names = [f"attitude {axis}" for axis in AXES] + [f"gyro bias {axis}" for axis in AXES]
     units = ["rad"] * 3 + ["rad/s"] * 3
     for block in blocks:
-        names += [f"{block.name} {component}" for component in block.components]
+        names += [error_state_name(block.name, component) for component in block.components]
         units += block.units
     return tuple(names), tuple(units)
 

@@ -27,7 +27,7 @@ from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording, whole_ns
 from strapdown.results import ByValue, Column, Listed, Table, figure
-from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_unit
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_name, error_state_unit
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -288,9 +288,15 @@ class Estimate(ByValue, Listed):
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
-                label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
                 word, size = self.state_unit(name, unit)
-                rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
+                rows.append(
+                    (
+                        error_state_name(name, component),
+                        word,
+                        states.values[-1, k] / size,
+                        *states.sigma[[-1, 0], k] / size,
+                    )
+                )
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, innovations in self.innovations.items():
             used = innovations.used
