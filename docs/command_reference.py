@@ -34,14 +34,9 @@ def _section(command: Any) -> str:
     options = [
         parameter for parameter in command.params if parameter.param_type_name == "option" and not parameter.hidden
     ]
-    usage = " ".join(
-        [
-            "strapdown",
-            command.name,
-            *((argument.metavar or argument.name.upper()) for argument in arguments),
-            "[options]",
-        ]
-    )
+    names = [(argument.metavar or argument.name.upper()) + "..." * (argument.nargs < 0) for argument in arguments]
+    places = [name if argument.required else f"[{name}]" for name, argument in zip(names, arguments, strict=True)]
+    usage = " ".join(["strapdown", command.name, *places, "[options]"])
     parts = [f"### strapdown {command.name}", _text(command.help), f"```sh\n{usage}\n```"]
     if command.epilog:
         examples = [line.strip() for line in command.epilog.splitlines() if line.strip().startswith("strapdown")]
