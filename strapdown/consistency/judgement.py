@@ -200,19 +200,10 @@ class Judgement(Listed):
 
     def listing(self) -> Table:
         """Return the verdict and each statistic with its bounds, as a table."""
+        bounds = lambda f: f"{figure(f.low)} to {figure(f.high)}" if math.isfinite(f.low) else ""  # noqa: E731
         rows = [
-            (
-                finding.name,
-                finding.label,
-                finding.value,
-                finding.low,
-                finding.high,
-                f"{figure(finding.low)} to {figure(finding.high)}" if math.isfinite(finding.low) else "",
-                finding.p_value,
-                float(finding.samples),
-                not finding.rejected,
-            )
-            for finding in self.findings
+            (f.name, f.label, f.value, f.low, f.high, bounds(f), f.p_value, float(f.samples), not f.rejected)
+            for f in self.findings
         ]
         columns = (
             Column("statistic", "statistic"),

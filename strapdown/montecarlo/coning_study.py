@@ -324,15 +324,9 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def _own_table(summary: Mapping[str, Any]) -> list[Table]:
     """Return the orders and drift constants of user-defined algorithms, with the best for their numbers of increments; none without any."""
-    columns = (
-        Column("algorithm", "name"),
-        Column("samples", "samples"),
-        Column("order", "order"),
-        Column("n", "drift_order"),
-        Column("C", "drift_constant"),
-        Column("optimum n", "best_drift_order"),
-        Column("C for the same increments", "best_drift_constant"),
-    )
+    labels = ("algorithm", "samples", "order", "n", "C", "optimum n", "C for the same increments")
+    keys = ("name", "samples", "order", "drift_order", "drift_constant", "best_drift_order", "best_drift_constant")
+    columns = list(map(Column, labels, keys))
     samples, rows = {drift["algorithm"]: drift["samples"] for drift in summary["integration"]}, []
     for own in summary.get("own", ()):
         exact = f" = {own['drift_constant']}" if Fraction(own["drift_constant"]).denominator < SHOWN_DENOMINATOR else ""
