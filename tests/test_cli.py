@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import h5py
@@ -17,6 +18,7 @@ from strapdown import cli, recordings, scenarios
 from strapdown.cli import COMMANDS
 from strapdown.cli.terminal import app
 from strapdown.estimation.setup import read_estimate
+from strapdown.montecarlo import coning_study
 from strapdown.montecarlo.coning_study import ALGORITHMS
 from strapdown.records import read_attributes
 
@@ -144,6 +146,13 @@ def coning(tmp_path_factory, blank) -> tuple[Path, dict, str]:
             cli.main()
     assert not end.value.code
     return out, json.loads((out / "coning.json").read_text()), said.get()
+
+
+def test_the_readme_shows_the_tables_of_the_study(coning):
+    shown = [line.split() for line in Path(__file__).parents[1].joinpath("README.md").read_text("utf-8").splitlines()]
+    for table in coning_study.tables(coning[1])[1:]:
+        assert table.title.split() in shown
+        assert all(line.split() in shown for line in takewhile(lambda line: line[0] != "-", table.lines))
 
 
 def test_coning_json_has_the_keys_that_others_read(coning):
