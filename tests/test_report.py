@@ -266,7 +266,8 @@ def test_two_estimates_on_one_page(folder, tmp_path):
     """The second is three times too sure and sees other measurements as more exact: the difference is that of the files."""
     first, second = (setup.read_estimate(folder / f"{name}.h5") for name in ("right", "wrong"))
     cut = {name: getattr(second, name)[100:-50] for name in ("time", "attitude", "bias", "variance", "covariance")}
-    setup.write_estimate(tmp_path / "cut.h5", dataclasses.replace(second, **cut, truth=None))
+    part_of = dataclasses.replace(second, **cut, truth=None, fixed_frame="East-North-Up")
+    setup.write_estimate(tmp_path / "cut.h5", part_of)
     gaps = first.truth.attitude.copy()
     gaps[:40] = np.nan
     lost = dataclasses.replace(first, truth=dataclasses.replace(first.truth, attitude=gaps))
@@ -280,6 +281,7 @@ def test_two_estimates_on_one_page(folder, tmp_path):
         numbers = json.loads(written.statistics.read_text())
         rms = np.sqrt(np.mean(difference[part] ** 2))
         assert numbers["attitude_difference_rms_rad"] == pytest.approx(rms, rel=1e-9)
+        assert ("fixed frames: the scenario&#x27;s and East-North-Up" in body(written.page)) == (other.stem == "cut")
         assert charts_of(body(written.page))[-1]["title"] == "Total attitude error relative to the truth"
     bias = np.sqrt(np.mean((second.bias - first.bias) ** 2, axis=0))
     np.testing.assert_allclose(numbers["bias_difference_rms_by_axis_rad_per_s"], bias, rtol=1e-9)

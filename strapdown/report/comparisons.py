@@ -55,9 +55,11 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     truth = a.truth
     if truth is not None:
         charts += _errors(time, truth.attitude[inside], (attitude, other), names)
+    frames = [estimate.fixed_frame or "the scenario's" for estimate in (a, b)]
+    differ = f"; fixed frames: {' and '.join(frames)}" if frames[0] != frames[1] else ""
     content = page.page(
         f"Two estimates: {names[0]}, {names[1]}",
-        f"{len(time)} epochs from {time[0]:g} to {time[-1]:g} s; the second is interpolated at the times of the first",
+        f"{len(time)} epochs from {time[0]:g} to {time[-1]:g} s; the second is interpolated at the times of the first{differ}",
         page.section("Key numbers", _numbers(difference, angle, (sigma, other_sigma), names)),
         page.section("Over time", page.beside_body(charts, time, attitude)),
     )
