@@ -67,7 +67,7 @@ PARTS: dict[str, Callable[[AhrsParameters], AhrsParameters] | tuple[Any, dict[st
     "drift of the gyro's bias": lambda p: replace(p, rate_random_walk=0.0),
     "hard iron": lambda p: replace(p, hard_iron_sigma=0.0),
     "deviation of the field": lambda p: replace(p, field_deviation=1e3),
-    "gaps filled by interpolation": (sensor_faults, {"interpolated": lambda rate: []}),
+    "gaps filled by interpolation": (sensor_faults, {"interpolated": lambda *_: []}),
 }
 """What is left out of the model."""
 

@@ -214,6 +214,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     velocity_time=1.0,
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
+    tilt_sigma=0.04,
     tilt_scale=5.5,
     heading_scale=12.0,
     gyro_scale_sigma=5e-3,
