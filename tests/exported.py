@@ -20,6 +20,7 @@ from strapdown.codegen.interpreted import FORMULAS
 from strapdown.kernels import machine
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic", "-ffp-contract=off")
+STRICT += ("-Wdouble-promotion",)
 
 
 def compiler(language="C"):
@@ -149,8 +150,7 @@ class Compiled:
     _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
     def __init__(self, program, folder, *, single=False, flags=("-O0",)):
-        flags = (*flags, "-Wdouble-promotion") if single else flags
-        key = program, flags
+        key = program, single, flags
         if key not in self._libraries:
             write(c_files(program, single=single), folder)
             build = [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", "filter.so", "-lm"]

@@ -20,7 +20,7 @@ TYPES = {"": "strapdown_real", "int": "int", "wide": "double", "status": "unsign
 
 def _number(x: float, single: bool) -> str:
     if math.isinf(x):
-        return "INFINITY" if x > 0.0 else "-INFINITY"
+        return f"{'-' if x < 0.0 else ''}HUGE_VAL{'F' if single else ''}"
     if not single:
         return repr(x)
     if 0.0 < abs(x) < SMALLEST:  # a bound that keeps a divisor from zero
