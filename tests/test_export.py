@@ -422,7 +422,6 @@ def test_the_sketches_of_the_guide_compile_and_run(place, tmp_path):
 
 
 REFUSED = {
-    "recovery": {"gate": sd.Gate()},
     "robust": {"robust": sd.Robust()},
     "integration": {"integration": sd.coning.ALGORITHMS["three-sample"]},
     "estimator": {"estimator": lambda record, initial: None},
@@ -453,6 +452,14 @@ def test_features_that_an_exported_or_a_live_filter_lacks_are_refused_before_any
     else:
         with pytest.raises(InputError, match=f"has no {FEATURES[name].words}"):
             sd.LiveFilter(setup.process_noise, start, blocks, **options)
+
+
+def test_a_gate_is_exported_without_its_recovery(tmp_path):
+    record, setup, _ = case("gate")
+    setups_ = setup, dataclasses.replace(setup, gate=sd.Gate())
+    first, other = ([p.read_text() for p in sd.export(s, record, folder=tmp_path)] for s in setups_)
+    assert first == other
+    assert "recovery = 0" in other[0]
 
 
 def test_refusals_of_arguments(tmp_path):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -61,7 +61,7 @@ def export(
     Parameters
     ----------
     setup : FilterSetup, LiveAhrs, path or str
-        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them. Or a motion of
+        Noise of the gyro, initial σ, σ of sensors, error states, gate without its recovery; or a TOML file of them. Or a motion of
         :data:`strapdown.ahrs.MOTIONS` (``"hand"``, …): the filter of :func:`strapdown.estimate` for an IMU; with other parameters, a
         ``LiveAhrs``, whose samples are left out.
     sensors : ImuRecord, Scenario or sequence of VectorSensor or VectorMeasurements, optional
@@ -87,7 +87,7 @@ def export(
     ------
     InputError
         If an argument is invalid, or the setup has what the exported filter has not: another estimator than the mekf, robust updates,
-        a gate with recovery, an integration algorithm of several samples, temperature, lever arms, noise that varies.
+        an integration algorithm of several samples, temperature, lever arms, noise that varies.
 
     Examples
     --------
@@ -115,6 +115,8 @@ def export(
             raise InputError("sensors are given, but the filter of an IMU has its own; leave them out")
         program = design.program_of_live(setup, single=single)
     else:
+        if setup.gate is not None:  # recovery would run a second filter beside the first
+            setup = replace(setup, gate=replace(setup.gate, recovery=None))
         program = design.program_of(setup, _sensors_of(sensors), single=single)
     source = program, traced(program), _origin(setup, precision)
     texts = c.files(*source, single=single) if to == "c" else javascript.files(*source)

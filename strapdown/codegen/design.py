@@ -90,7 +90,6 @@ def _need_exportable(setup: FilterSetup) -> None:
     """Refuse what the exported filter does not have."""
     refuse(f"the estimator is {setup.estimator_name}, but {EXPORTED}", estimator=setup.estimator_name != "mekf")
     refuse(EXPORTED, robust=setup.robust is not None)
-    refuse(EXPORTED, recovery=setup.gate is not None and setup.gate.recovery is not None)
     refuse(
         f"the integration is {setup.integration.name}, but {EXPORTED}",
         integration=setup.integration.samples != 1 or setup.integration.name != "one-sample",

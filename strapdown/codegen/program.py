@@ -40,7 +40,7 @@ MEANINGS = {
         BAD_INPUT,
         "Not a number, infinite, no length, dt not in (0, 3600] s, or a turn of over 100 rad: not used.",
     ),
-    "REJECTED": (REJECTED, "The gate refused the measurement: not used."),
+    "REJECTED": (REJECTED, "The gate refused the measurement: not used. After many in a row, start again by init."),
     "NO_HEADING": (NO_HEADING, "The vector was vertical and has no heading: not used."),
     "TOO_PRECISE": (
         TOO_PRECISE,

@@ -30,12 +30,6 @@ FEATURES = {
         False,
         "use one-sample, or correct the increments for coning before they are given to it",
     ),
-    "recovery": Feature(
-        "recovery of the gate, which runs a second filter beside the first",
-        True,
-        "leave it out (recovery = 0 in [filter.gate], in Python recovery=None), and start again by init when the status reports rejections "
-        "in a row",
-    ),
     "robust": Feature("robust updates, which iterate a weight", True, "use a gate, or none"),
     "varying": Feature("noise or reference that varies from sample to sample", True, "give one for all"),
 }
