@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import math
 from collections.abc import Callable, Mapping
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from strapdown.codegen.interpreted import Interpreter, Module, parsed
 from strapdown.codegen.program import Program, work_size
 from strapdown.codegen.symbols import Symbol
 from strapdown.kernels import headings, rests
+from strapdown.units import DEGREE
 
 OWN: set[Any] = {
     *(
@@ -151,6 +153,10 @@ def traced(program: Program) -> list[Target]:
     m = Target(program, "", {}, {})
     if r is None:
         m.define(body.init, {"attitude": 4}, {})
+        angle, bias = (math.sqrt(program.covariance[i][i]) for i in (0, 3))
+        m.functions["init"][0].words = (
+            f"Start at an attitude, sigma {angle:.6g} rad = {angle / DEGREE:.4g} deg about each axis, and at zero bias, sigma {bias:.6g} rad/s."
+        )
         m.define(body.predict, {"gyro": 3, "dt": 0}, {})
         for sensor in program.sensors:
             m.define(body.update, {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
