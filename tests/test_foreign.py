@@ -20,6 +20,7 @@ from strapdown.checks import InputError
 from strapdown.consistency import alignment, foreign
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
+from strapdown.motion import SpinCone
 from strapdown.recordings import attitudes, recordfiles
 from strapdown.recordings.attitudes import Attitudes, read_attitudes
 from strapdown.records import Truth
@@ -431,6 +432,20 @@ def test_conventions_of_quaternions_are_found(run, convention, words):
     assert outcome.judgement.verdict != "not consistent"
     assert outcome.alignment.estimated == ()
     assert any(words in remark for remark in outcome.remarks)
+
+
+@pytest.mark.parametrize("seed", [3, 24], ids=["clock", "convention"])
+def test_a_bad_filter_is_not_explained_by_its_clock_or_convention(seed):
+    """Errors of some degrees that drift; the motion is a cone, where a shift in time is nearly two rotations."""
+    time = np.arange(150.0)
+    cone = SpinCone(angle=20.0 * DEGREE, precession_rate=20.0 * DEGREE, spin_rate=-10.0 * DEGREE)
+    truth = cone.attitude(time)
+    drift = np.cumsum(0.6 * DEGREE * np.random.default_rng(seed).standard_normal((150, 3)), axis=0)
+    own = alignment.Series(time, quaternion.multiply(truth, quaternion.exp(drift)))
+    remarks = []
+    aligned, found = alignment.align_series(own, alignment.Series(time, truth), None, remarks)
+    assert aligned is own
+    assert (remarks, "time" in found.estimated) == ([], False)
 
 
 def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():

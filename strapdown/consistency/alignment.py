@@ -242,6 +242,8 @@ def _descended(
 ) -> Alignment:
     covariance = np.zeros((7, 7))
     residual = np.inf
+    common = min(own.time[-1] + offset, theirs.time[-1]) - max(own.time[0] + offset, theirs.time[0])
+    near = offset + np.array([-1.0, 1.0]) * min(LONGEST_OFFSET, 0.5 * common)  # half of the common time remains common
     for _ in range(20):
         matched, truth = at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
@@ -264,7 +266,7 @@ def _descended(
         covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
         fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
         body = quaternion.normalize(quaternion.multiply(body, quaternion.exp(step[3:6])))
-        offset += float(step[6])
+        offset = float(np.clip(offset + step[6], *near))
         residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
         if np.all(np.abs(step) <= 1e-3 * np.sqrt(np.diag(covariance)) + 1e-12):
             break
@@ -302,11 +304,13 @@ def align_series(
     if wanted is not None:
         return own, fit(own, theirs, wanted, offset)
     whole = fit(own, theirs, ALIGNED, offset)
-    if _gross(whole):
+    if _gross(whole, GROSS):
         others = {words: replace(own, attitude=meant(own.attitude)) for words, meant in _CONVENTIONS.items()}
         fits = {words: fit(other, theirs, ALIGNED, offset) for words, other in others.items()}
-        words = min(fits, key=lambda words: _gross(fits[words]))
-        if _gross(fits[words]) < _gross(whole):
+        # A filter may be bad in any convention: residuals that are nearly the same do not decide.
+        limit = max(GROSS, 1.5 * min(fitted.residual for fitted in (whole, *fits.values())))
+        words = min(fits, key=lambda words: _gross(fits[words], limit))
+        if _gross(fits[words], limit) < _gross(whole, limit):
             remarks.append(f"the quaternions fit the truth best if read as {words}, so they are read as such")
             own, whole = others[words], fits[words]
     moved = ("time",) if abs(whole.offset) > 3.0 * whole.sigma[6] + 1e-9 else ()
@@ -319,10 +323,10 @@ def align_series(
     return own, fitted
 
 
-def _gross(fitted: Alignment) -> int:
-    """Return the number of gross rotations, plus 3 if even with them the residual is gross."""
+def _gross(fitted: Alignment, limit: float) -> int:
+    """Return the number of gross rotations, plus 3 if even with them the residual is above the limit, rad."""
     turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (fitted.fixed, fitted.body))
-    return turned + (3 if fitted.residual > GROSS else 0)
+    return turned + (3 if fitted.residual > limit else 0)
 
 
 _CONVENTIONS = {
