@@ -259,6 +259,8 @@ def test_the_command_writes_a_filter_that_compiles_and_says_what_it_is(run, tmp_
         (("hand",), "rate is missing"),
         (("hand", "spin", "--rate", "100"), "an IMU has its own"),
         (("hand", "--rate", "-1"), "rate is -1"),
+        (("hand", "--rate", "1e7"), "interval is 1e-07 s; give that of the samples"),
+        (("filter.toml", "flight.HDF5"), "flight.HDF5 does not exist"),
         (("filter.toml", "--rate", "100"), "rate and magnetometer are of an IMU"),
     ],
 )

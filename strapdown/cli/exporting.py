@@ -26,8 +26,8 @@ def export(
     """Export a filter as source code for a microcontroller or a web page."""
     source: Any = sensors
     if sensors is not None:
-        recorded = Path(sensors).suffix in (".h5", ".csv")
-        source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
+        named = Path(sensors).suffix.lower() in ("", ".toml")
+        source = sd.scenarios.load_scenario(sensors) if named else sd.read(sensors)
     paths = sd.export(filter_file, source, folder=out, rate=rate, magnetometer=magnetometer, to=to, precision=precision)
     ui.say(f"Filter of {filter_file} for {sensors or f'an IMU at {rate:g} Hz'}, {precision} precision.")
     ui.written(*paths)

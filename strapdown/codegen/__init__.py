@@ -153,7 +153,10 @@ def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | V
 
     if isinstance(sensors, Scenario):
         return simulate(sensors).vectors
-    raise InputError(f"sensors is {type(sensors).__name__}; give a record, a scenario, or a sequence of sensors")
+    remedy = (
+        f"give a record, a scenario, or a sequence of sensors; for an IMU, a motion ({', '.join(MOTIONS)}) as the setup"
+    )
+    raise InputError(f"sensors is {type(sensors).__name__}; {remedy}")
 
 
 def _origin(setup: FilterSetup | LiveAhrs, precision: str) -> str:
