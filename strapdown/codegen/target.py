@@ -154,9 +154,8 @@ def traced(program: Program) -> list[Target]:
     if r is None:
         m.define(body.init, {"attitude": 4}, {})
         angle, bias = (math.sqrt(program.covariance[i][i]) for i in (0, 3))
-        m.functions["init"][
-            0
-        ].words = f"Start at an attitude, sigma {angle:.6g} rad = {angle / DEGREE:.4g} deg about each axis, and at zero bias, sigma {bias:.6g} rad/s."
+        start = f"Start at an attitude, sigma {angle:.6g} rad = {angle / DEGREE:.4g} deg about each axis"
+        m.functions["init"][0].words = f"{start}, and at zero bias, sigma {bias:.6g} rad/s."
         m.define(body.predict, {"gyro": 3, "dt": 0}, {})
         for sensor in program.sensors:
             m.define(body.update, {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
