@@ -352,7 +352,7 @@ def test_the_header_has_the_sigma_of_each_axis(sensor, words, tmp_path):
     header = (tmp_path / "strapdown_filter.h").read_text(encoding="utf-8")
     text = " ".join(header.replace("*", " ").split())
     assert words in text
-    assert "Start at an attitude, sigma 0.4 rad = 22.92 deg about each axis, and at zero bias, sigma 0.005 rad/s." in text
+    assert "sigma 0.4 rad = 22.92 deg about each axis, and at zero bias, sigma 0.005 rad/s." in text
 
 
 def test_the_example_and_the_header_of_the_export(tmp_path):

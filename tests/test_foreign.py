@@ -258,6 +258,11 @@ def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys
     assert saved["error_frame"] == "fixed"
     assert saved["error_frame_probability"]["fixed"] > 0.99
     assert "the covariance is read as fixed" in said
+    topics = "/imu/data,/imu/reference"
+    both = command(
+        monkeypatch, capsys, "check", files / "estimate.mcap", "--truth", files / "estimate.mcap", "--topic", topics
+    )
+    assert (both[0], "Truth: estimate.mcap" in both[1]) == (status, True), both
     e, t = run.estimate, run.record.truth
     cut = slice(1, None)
     alone = consistency.judge(
@@ -717,6 +722,8 @@ def test_a_repeated_innovation_of_a_flight_log_is_no_measurement():
     [
         (("estimate.tum",), "has no innovations, so it cannot be judged without a truth"),
         (("estimate.h5", "--align", "none"), "--align goes with --truth"),
+        (("estimate.h5", "--topic", "/imu/data"), "--topic goes with --truth"),
+        (("estimate.h5", "--json", "verdict.txt"), "--json is verdict.txt"),
         (("estimate.csv", "--truth", "record.h5", "--align", "clock"), "align"),
         (("estimate.csv", "--truth", "record.h5", "--error-frame", "ned"), "--error-frame 'ned'"),
         (("estimate.csv", "--truth", "record.h5", "--record", "record.h5"), "leave out --truth"),

@@ -20,6 +20,7 @@ class _Foreign:
     """With a truth: an estimate of any filter."""
 
     truth: Path | None = Option(None, help="Reference attitudes, any clock and frames: TUM, EuRoC, BROAD, CSV, bag.")
+    topic: str = Option("", help="Topic of the estimate, if a bag has several, or of both: ESTIMATE,TRUTH.")
     error_frame: str = Option("find", help="Frame of the covariance: body, fixed or euler; find: by the errors.")
     align: str = Option(
         "auto",
@@ -35,7 +36,6 @@ def check(
         help="HDF5 file of `strapdown estimate` or `strapdown montecarlo`; or an estimate of any filter: CSV, TUM, ROS bag, ULog."
     ),
     foreign: _Foreign,
-    topic: str | None = Option(None, help="Topic of the estimate, if a bag has several."),
     confidence_level: float = Option(0.99, help="Minimum probability with which a consistent filter passes all tests."),
     detectable_error: float = Option(1.5, help="Factor on σ that the tests must be able to detect."),
     record: Path | None = Option(None, help="Record from which the estimate was made, to search for likely causes."),
@@ -68,7 +68,7 @@ def check(
         content: dict[str, Any] = {"source": result.name, "kind": reading.kind(result)}
         ui.say(f"{result.name}: {held.extent}.")
     else:
-        judgement, content = _judged_foreign(result, topic or "", foreign, how)
+        judgement, content = _judged_foreign(result, foreign, how)
     table, words = judgement.listing(), judgement.words
     if judgement.findings:
         ui.show(table, title=ui.EVIDENCE)
@@ -82,12 +82,12 @@ def check(
     return content | judgement.summary()
 
 
-def _judged_foreign(result: Path, topic: str, options: _Foreign, how: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
+    topic, _, true_topic = options.topic.partition(",")
     own = sd.read_attitudes(result, topic=topic)
-    truth = None if options.truth is None else sd.read_attitudes(options.truth)
-    how |= {"error_frame": options.error_frame, "align": options.align}
-    checked = sd.consistency.check_attitudes(own, truth, **how)
+    truth = None if options.truth is None else sd.read_attitudes(options.truth, topic=true_topic)
+    checked = sd.consistency.check_attitudes(own, truth, error_frame=options.error_frame, align=options.align, **how)
     ui.say(f"{own.source}: {own.extent}.", *own.remarks)
     ui.say("" if truth is None else f"Truth: {truth.source}, {truth.extent}.")
     ui.say(*(f"Note: {remark}." for remark in checked.remarks))

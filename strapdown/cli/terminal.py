@@ -114,7 +114,7 @@ def command(*extra: str) -> Callable[[Callable[..., Any]], Callable[..., None]]:
             if printed:  # all other output then goes to standard error
                 console.stderr = True
             elif target is not None:
-                check_files(target, suffixes=(".json",), name="json")
+                check_files(target, suffixes=(".json",), name="--json")
             if folder is not None:
                 usable_folder("--tables", folder)
             for name in groups:
