@@ -313,7 +313,7 @@ def test_a_place_that_cannot_be_written_is_reported_before_the_work(there, tmp_p
     else:  # reported by the system, whoever runs the tests
         monkeypatch.setattr("os.access", lambda path, mode, **_: not mode & os.W_OK)
         said = refused_at_once([*command, tmp_path / "b" / target])
-        assert f"no permission to write to {tmp_path}" in said
+        assert f"cannot be written: there is no permission to write to {tmp_path}" in said
         assert not list(tmp_path.iterdir())
 
 

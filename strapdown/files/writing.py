@@ -127,9 +127,9 @@ def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
     while not place.exists():
         place = place.parent
     if not place.is_dir():
-        raise InputError(f"{name} is {folder}, but {place} is a file; choose another folder")
+        raise InputError(f"{name} cannot be written: {place} is a file; choose another folder")
     if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{name} is {folder}, but there is no permission to write to {place}; choose another folder")
+        raise InputError(f"{name} cannot be written: there is no permission to write to {place}; choose another folder")
 
 
 def writable(
