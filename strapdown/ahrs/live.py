@@ -28,8 +28,6 @@ from strapdown.vectors import VectorMeasurements
 
 MAX_SAMPLES_RATIO = 4
 """Samples of a step, in multiples of the usual number, above which the declared interval is wrong."""
-SHORTEST_INTERVAL = 1e-6
-"""Minimum interval of the samples, s; the filter holds all samples of a step."""
 
 
 class LiveAhrs:
@@ -82,8 +80,8 @@ class LiveAhrs:
         latency: float | None = None,
     ) -> None:
         self.interval = positive("interval", interval, unit="s")
-        if not SHORTEST_INTERVAL <= self.interval <= starting.QUIET_SPAN:
-            raise InputError(f"interval is {interval:g} s; give that of the samples, {SHORTEST_INTERVAL:g} to 1 s: 0.01 for 100 Hz")
+        if not 1e-6 <= self.interval <= starting.QUIET_SPAN:  # the filter holds all samples of a step
+            raise InputError(f"interval is {interval:g} s; give that of the samples, 1e-6 to 1 s: 0.01 for 100 Hz")
         instance("magnetometer", magnetometer, bool, "give True or False")
         if parameters is not None:
             instance("parameters", parameters, AhrsParameters, 'such as ahrs.of_motion("vehicle", magnetometer=True)')

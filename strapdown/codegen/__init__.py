@@ -153,9 +153,7 @@ def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | V
 
     if isinstance(sensors, Scenario):
         return simulate(sensors).vectors
-    remedy = (
-        f"give a record, a scenario, or a sequence of sensors; for an IMU, a motion ({', '.join(MOTIONS)}) as the setup"
-    )
+    remedy = "give a record, a scenario or a sequence of sensors; for an IMU, a motion as the setup"
     raise InputError(f"sensors is {type(sensors).__name__}; {remedy}")
 
 
