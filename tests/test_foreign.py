@@ -682,6 +682,11 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         ("time_s,qw,qx,qy,qz,cov_xx_rad2,cov_yy_rad2", "1,1,0,0,0,1,1", "cov_zz is missing|cov_xy is missing"),
         ("time_s,qw,qx,qy,qz,cov_body_xx,cov_fixed_yy", "1,1,0,0,0,1,1", "name all its columns alike"),
         ("time_s,qw,qx,qy,qz,q_w", "1,1,0,0,0,1", "has the same meaning"),
+        (
+            "time_s,qw,qx,qy,qz,roll_sigma_deg,pitch_sigma_deg,yaw_sigma_deg",
+            "1,1,0,0,0,3,0,3",
+            "σ of pitch in data row 1 is not",
+        ),
         ("time_s,qw,qx,qy,qz", "3,,,,\n4,1,0,0,0", "row 4 is not after the one before"),
     ],
 )

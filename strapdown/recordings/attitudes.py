@@ -313,6 +313,10 @@ def _covariance(name: str, columns: Mapping[str, Mapping[str, Array]], m: int) -
     for group, axes, frame in (("sigma", "xyz", ""), ("angle", ("roll", "pitch", "yaw"), "euler")):
         if set(columns[group]) == set(axes):
             sigma = np.stack([columns[group][axis] for axis in axes], axis=1)
+            for row, k in np.argwhere(sigma <= 0.0):
+                raise InputError(
+                    f"{name}: σ of {axes[k]} in data row {row + 1} is not above zero; leave it empty if unknown"
+                )
             words = "The file has σ and no covariance: errors of different axes are treated as independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
     words = (
