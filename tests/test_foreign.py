@@ -448,9 +448,9 @@ def test_a_bad_filter_is_not_explained_by_its_clock_or_convention(seed):
     drift = np.cumsum(0.6 * DEGREE * np.random.default_rng(seed).standard_normal((150, 3)), axis=0)
     own = alignment.Series(time, quaternion.multiply(truth, quaternion.exp(drift)))
     remarks = []
-    aligned, found = alignment.align_series(own, alignment.Series(time, truth), None, remarks)
+    aligned, removed = alignment.align_series(own, alignment.Series(time, truth), None, remarks)
     assert aligned is own
-    assert (remarks, "time" in found.estimated) == ([], False)
+    assert (remarks, "time" in removed.estimated) == ([], False)
 
 
 def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():
