@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from measured import waves
+from measured import HAND, waves
 from two_stars import stars
 
 import strapdown as sd
@@ -250,6 +250,11 @@ def test_commutation_is_named_with_the_rate_that_it_implies(algorithm, truth):
     assert named(explanation) == ("commutation", algorithm)
     assert explanation.causes[0].estimate == pytest.approx([0.0, 0.0, predicted], abs=0.06 * abs(predicted))
     assert "°/h" in explanation.words
+
+
+def test_commutation_that_varies_is_named():
+    slow = replace(scenario(), motion=HAND, rate=10.0)
+    assert named(diagnosed(Case("commutation", "one-sample", slow), 0)) == ("commutation", "one-sample")
 
 
 def test_an_algorithm_that_serves_is_given_no_cause():

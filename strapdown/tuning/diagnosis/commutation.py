@@ -46,8 +46,11 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
     return drift.sum(axis=0) / step.sum(), means.std(axis=0, ddof=1) / math.sqrt(parts)
 
 
-def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth: Truth | None) -> Cause:
-    """Return commutation as a cause; its gain is by the bias error that it explains at the end, or would without a truth."""
+def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth: Truth | None, better: float) -> Cause:
+    """Return commutation as a cause; its gain is by the bias error that it explains at the end, or would without a truth.
+
+    Or it is ``better``, that of the innovations with the accurate algorithm, which has no parameter: its p-value is at most exp(−gain/2).
+    """
     drift, error = commutation_drift(record, setup.integration)
     assert estimate.covariance is not None
     P = estimate.covariance[-1, 3:, 3:] + np.diag(error**2)
@@ -65,10 +68,10 @@ def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth
         estimate=drift,
         standard_error=error,
         unit="rad/s",
-        gain=gain,
-        log_p=log_p(gain, 1),
+        gain=max(gain, better),
+        log_p=min(log_p(gain, 1), -0.5 * better, 0.0),
         words=(
-            f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h, estimated as gyro bias; "
+            f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h on average, estimated as gyro bias; "
             f"the filter's σ in this direction is {sigma / DEGREE_PER_HOUR:.3g} °/h"
         ),
     )

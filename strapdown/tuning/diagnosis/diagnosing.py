@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from strapdown import consistency, estimation
+from strapdown import coning, consistency, estimation
 from strapdown.checks import InputError
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.records import Estimate, ImuRecord
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
-from strapdown.tuning.diagnosis.commutation import commutation
+from strapdown.tuning.diagnosis.commutation import ACCURATE_ALGORITHM, commutation
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
 from strapdown.tuning.diagnosis.likelihood import Model, Run, by_mean, by_variance, run
 
@@ -69,7 +69,9 @@ def diagnose(
     if judgement is None:
         judgement = consistency.judge(estimate, kept, confidence_level=probability)
     base = run(model)
-    considered = [*_causes(model, base, estimate), commutation(record, setup, estimate, kept)]
+    accurate = modelled_record(record, replace(setup, integration=coning.ALGORITHMS[ACCURATE_ALGORITHM]))
+    better = run(replace(model, record=replace(accurate, truth=None))).closer_than(base)
+    considered = [*_causes(model, base, estimate), commutation(record, setup, estimate, kept, better)]
     worst = max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in estimate.innovations.values() if len(i.time))
     if worst > GROSS:
         considered += conventions(model, base)
