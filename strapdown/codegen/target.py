@@ -19,16 +19,8 @@ from strapdown.kernels import headings, rests
 from strapdown.units import DEGREE
 
 OWN: set[Any] = {
-    *(
-        body.far_turn,
-        body.prepare,
-        body.step,
-        body.propagate,
-        body.take_row,
-        body.subtract,
-        body.apply_step,
-        body.update,
-    ),
+    *(body.far_turn, body.prepare, body.step, body.propagate, body.take_row),
+    *(body.subtract, body.apply_step, body.update),
     *(recording.begin, recording.carry_to_sample, recording.end_step, recording.use_rest),
     *(headings.look, headings.insert, headings.iron_step, rests.find_rest, rests.clear_span),
 }
