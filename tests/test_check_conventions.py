@@ -268,6 +268,7 @@ def test_a_slow_gyro_in_mrad_per_s_is_named(reference):
     slow = simulated(9, amplitude=0.3, reference=reference)
     examination = check_conventions.examine(replace(slow, rate=1e3 * slow.rate))
     assert examination.reason.startswith("gyro rates are 1000 times too large (mrad/s read as rad/s")
+    assert examination.listing().cells[0][0] == "gyro in mrad/s"
 
 
 def test_all_axes_are_signed_permutations_the_identity_first():

@@ -19,7 +19,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -39,10 +38,7 @@ from strapdown.records.recording import Recording
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
-__all__ = [
-    "Examination",
-    "examine",
-]
+__all__ = ["Examination", "examine"]
 
 AXES: tuple[Array, ...] = tuple(
     np.array([[s if column == where else 0.0 for column in range(3)] for where, s in zip(order, signs, strict=True)])
@@ -67,19 +63,32 @@ FRAMES: dict[str, Array] = {
 """Fixed frames, with the matrices that transform their components to East-North-Up."""
 
 
-def _unit(fault: str, taken: str, sensor: str, unit: str) -> str:
-    """Return the description of a wrong unit, with its remedy."""
-    return f"{fault} ({taken}; {Hint('units', {sensor: unit})})"
+class Change(NamedTuple):
+    """A change of the declared conventions."""
+
+    words: str
+    """With the hint to its remedy."""
+    brief: str
+    """In few words, for a row of a table."""
 
 
-GYRO_UNITS: dict[str, float] = {
-    "": 1.0,
+SHORT = {"accelerometer": "acc", "magnetometer": "mag", "gyro": "gyro", "whole unit": "whole unit"}
+
+
+def _unit(fault: str, taken: str, sensor: str, unit: str) -> Change:
+    """Return the change of a wrong unit."""
+    return Change(f"{fault} ({taken}; {Hint('units', {sensor: unit})})", f"{SHORT[sensor]} in {unit}")
+
+
+AS_DECLARED = Change("", "")
+GYRO_UNITS: dict[Change, float] = {
+    AS_DECLARED: 1.0,
     _unit("gyro rates are 57.3 times too large", "deg/s read as rad/s", "gyro", "deg/s"): math.pi / 180.0,
     _unit("gyro rates are 57.3 times too small", "rad/s read as deg/s", "gyro", "rad/s"): 180.0 / math.pi,
     _unit("gyro rates are 1000 times too large", "mrad/s read as rad/s, or mdeg/s as deg/s", "gyro", "mrad/s"): 1e-3,
 }
-FORCE_UNITS: dict[str, float] = {
-    "": 1.0,
+FORCE_UNITS: dict[Change, float] = {
+    AS_DECLARED: 1.0,
     _unit("specific force is 9.81 times too small", "g read as m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
     _unit("specific force is 9.81 times too large", "m/s² read as g", "accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
     _unit("specific force is 102 times too large", "mg read as m/s²", "accelerometer", "mg"): 1e-3 * STANDARD_GRAVITY,
@@ -87,7 +96,6 @@ FORCE_UNITS: dict[str, float] = {
 }
 
 NO_CHANGE = "no change"
-_WORDY = r"axes of the |the (?=ref)|'s fixed frame is| quaternions|should be read as |are |is (?=\d)| \((?:[^()]*( read as | to ).*?)?\)"
 PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
 """m₀ of relations to a reference, and of those between sensors only, which the gyro's bias disturbs. To those of the accelerometer the
@@ -117,12 +125,6 @@ def axes_words(matrix: Array) -> str:
     return ", ".join(names)
 
 
-def _brief(text: str) -> str:
-    """Return a change, or the name of a relation, without hints and in few words."""
-    brief = re.sub(_WORDY, "", Hint.replaced(text, lambda _: ""))
-    return brief.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
     """One explanation of a recording.
@@ -131,6 +133,8 @@ class Candidate:
     ----------
     changes : tuple of str
         Changes of the declared conventions; empty: none.
+    brief : tuple of str
+        The same in few words.
     score : float
         Log-likelihood less the penalty for changes.
     misfit : mapping of str to float
@@ -138,18 +142,9 @@ class Candidate:
     """
 
     changes: tuple[str, ...]
+    brief: tuple[str, ...]
     score: float
     misfit: Mapping[str, float]
-
-    @property
-    def words(self) -> str:
-        """The changes in one line."""
-        return "; ".join(self.changes) or NO_CHANGE
-
-    @property
-    def brief(self) -> str:
-        """At most two of the changes, in few words, for a row of a table."""
-        return "; ".join([*map(_brief, self.changes[:2]), *["…"] * (len(self.changes) > 2)]) or NO_CHANGE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,8 +187,10 @@ class Examination:
     def listing(self) -> Table:
         """Return the best explanations as a table; the hints to their remedies are in the verdict."""
         columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
-        columns += [Column(_brief(name), shown="{:.3f}".format) for name in self.candidates[0].misfit]
-        rows = [(candidate.brief, candidate.score, *candidate.misfit.values()) for candidate in self.candidates[:8]]
+        relations = ("–".join(SHORT[sensor] for sensor in name.split(" and ")) for name in self.candidates[0].misfit)
+        columns += [Column(relation, shown="{:.3f}".format) for relation in relations]
+        brief = lambda changes: "; ".join(changes[:2]) + "; …" * (len(changes) > 2) or NO_CHANGE  # noqa: E731
+        rows = [(brief(best.brief), best.score, *best.misfit.values()) for best in self.candidates[:8]]
         title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
         return Table(title, columns, rows)
 
@@ -250,7 +247,8 @@ def examine(recording: Recording) -> Examination:
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
     stuck = stuck_words(recording)
     doubts += _too_fast(recording) + stuck
-    unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
+    # Gravity alone shows it, whatever the turns do.
+    unsaid = [f"as it seems, {change.words}" for change in unit_changes]
     upright = at_rest(recording)
     explained = _without_reference if recording.true_attitude is None else _with_reference
     explanations = explained(recording, sensors, step)
@@ -263,7 +261,7 @@ def examine(recording: Recording) -> Examination:
         if stuck:
             result = replace(result, verdict="cannot tell", reason="a sensor is stuck; see the warning")
         elif not doubts and (doubts := _without_gravity(result.candidates[0], sensors.get("accelerometer"))):
-            result = replace(result, verdict="cannot tell", reason="the accelerometer does not show gravity")
+            result = replace(result, verdict="cannot tell", reason="the accelerometer shows no gravity")
             unsaid = []
     if upright and result.verdict == "as declared":
         result = replace(result, verdict="cannot tell", reason="the sensors agree; see the warning on their sign")
@@ -277,27 +275,28 @@ class _Explanations(NamedTuple):
     """Misfits (m,) of each relation."""
     number: Array
     """Number of changes (m,)."""
-    changes: Callable[[int], tuple[str, ...]]
+    changes: Callable[[int], tuple[Change, ...]]
     """Changes of one of them."""
     floors: dict[str, float]
     """m₀ of each relation."""
 
 
-def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], notes: tuple[str, ...]) -> Examination:
-    fit = np.sum([_score(values, explanations.floors[name]) for name, values in explanations.misfit.items()], axis=0)
-    score = fit - PENALTY * explanations.number
+def _concluded(source: str, tried: _Explanations, sure: tuple[Change, ...], notes: tuple[str, ...]) -> Examination:
+    fit = np.sum([_score(values, tried.floors[name]) for name, values in tried.misfit.items()], axis=0)
+    score = fit - PENALTY * (tried.number + len(sure))
     order = np.argsort(-score, kind="stable")
     named = order[0] if score[order[0]] - score[0] >= MARGIN else 0
     equal = [k for k in order[fit[order] > fit[named] - MARGIN] if k != named]
     best = [
         Candidate(
-            changes=(*explanations.changes(k), *sure),
-            score=float(score[k]) - PENALTY * len(sure),
-            misfit={name: float(values[k]) for name, values in explanations.misfit.items()},
+            changes=tuple(change.words for change in (*tried.changes(k), *sure)),
+            brief=tuple(change.brief for change in (*tried.changes(k), *sure)),
+            score=float(score[k]),
+            misfit={name: float(values[k]) for name, values in tried.misfit.items()},
         )
         for k in order[:12]
     ]
-    words = "; ".join((*explanations.changes(named), *sure))
+    words = lambda k: "; ".join(change.words for change in (*tried.changes(k), *sure)) or NO_CHANGE  # noqa: E731
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best[0].misfit.values()) > POOR:
         verdict = "cannot tell"
@@ -306,13 +305,13 @@ def _concluded(source: str, explanations: _Explanations, sure: tuple[str, ...], 
         )
     elif len(equal) > MAX_EQUAL:
         verdict = "cannot tell"
-        reason = f"{len(equal)} other explanations fit as well as “{words or NO_CHANGE}”: the rotation is too small, or about one axis only"
+        reason = f"{len(equal)} other explanations fit as well as “{words(named)}”: the rotation is too small, or about one axis only"
+    elif named or sure:
+        verdict, reason = "wrong convention", words(named)
     else:
-        verdict = "wrong convention" if words else "as declared"
-        reason = words or "no change explains the recording better than its declared conventions"
+        verdict, reason = "as declared", "no change explains the recording better than its declared conventions"
     if equal and verdict != "cannot tell":
-        others = ("; ".join((*explanations.changes(k), *sure)) or NO_CHANGE for k in equal)
-        notes = (*notes, "fits as well: " + " / ".join(others))
+        notes = (*notes, "fits as well: " + " / ".join(map(words, equal)))
     return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(best), notes=notes)
 
 
@@ -386,13 +385,13 @@ def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
     return -math.asin(float(np.clip(mean @ up / np.linalg.norm(mean), -1.0, 1.0)))
 
 
-def _gravity(strength: float) -> tuple[str, float]:
+def _gravity(strength: float) -> tuple[Change, float]:
     """Return the change of unit by which a specific force of this magnitude is nearest to gravity, and gravity in its unit."""
-    words = min(FORCE_UNITS, key=lambda name: abs(math.log(strength * FORCE_UNITS[name] / STANDARD_GRAVITY)))
-    return words, STANDARD_GRAVITY / FORCE_UNITS[words]
+    change = min(FORCE_UNITS, key=lambda unit: abs(math.log(strength * FORCE_UNITS[unit] / STANDARD_GRAVITY)))
+    return change, STANDARD_GRAVITY / FORCE_UNITS[change]
 
 
-def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
+def _force_unit(force: _Sensor) -> tuple[tuple[Change, ...], list[str]]:
     """Return the change of unit by which the median specific force is gravity, and the doubt if there is none.
 
     The median of a unit that is swung is larger than gravity by about the variation of the specific force.
@@ -400,10 +399,10 @@ def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
     strength = force.strength
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
-    words, gravity = _gravity(strength)
+    change, gravity = _gravity(strength)
     if abs(math.log(strength / gravity)) > 0.5 + float(np.std(force.size)) / strength:
         return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g; gravity must be in it"]
-    return ((words,) if words else ()), []
+    return (change,) * (change != AS_DECLARED), []
 
 
 MIN_GRAVITY = 0.6
@@ -638,8 +637,8 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
     ``parts``: misfits of each sensor by reading and frame of the reference, and by setting of the sensor; ``floors``: m₀ of each.
     """
     commons = [
-        (f"reference quaternions are {reading}",) * (reading != "")
-        + (f"the reference's fixed frame is {frame}",) * (frame != "East-North-Up")
+        (Change(f"reference quaternions are {reading}", f"reference {reading}"),) * (reading != "")
+        + (Change(f"the reference's fixed frame is {frame}", f"reference {frame}"),) * (frame != "East-North-Up")
         for reading in ("", *ATTITUDE_READINGS)
         for frame in FRAMES
     ]
@@ -660,7 +659,7 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
         misfit[name] = np.take_along_axis(values, settings[name], axis=1)
     kept = np.flatnonzero(np.all([setting >= 0 for setting in settings.values()], axis=0))
 
-    def changes(k: int) -> tuple[str, ...]:
+    def changes(k: int) -> tuple[Change, ...]:
         common, column = divmod(int(kept[k]), number.shape[1])
         if column >= columns:
             return (*commons[common], _axes_change("whole unit", alike[column - columns]))
@@ -671,22 +670,23 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
 
 
 @functools.cache
-def _settings(name: str) -> tuple[tuple[str, ...], ...]:
+def _settings(name: str) -> tuple[tuple[Change, ...], ...]:
     """Return the changes of each setting of a sensor: axes and, for the gyro, units."""
-    units = GYRO_UNITS if name == "gyro" else ("",)
+    units = GYRO_UNITS if name == "gyro" else (AS_DECLARED,)
     return tuple(
-        (_axes_change(name, k),) * (k > 0) + (unit,) * (unit != "") for k in range(len(AXES)) for unit in units
+        (_axes_change(name, k),) * (k > 0) + (unit,) * (unit != AS_DECLARED) for k in range(len(AXES)) for unit in units
     )
 
 
 @functools.cache
-def _axes_change(name: str, k: int) -> str:
+def _axes_change(name: str, k: int) -> Change:
     if np.array_equal(AXES[k], -np.eye(3)):
-        return f"axes of the {name} are inverted" + (f" ({Hint('invert', name)})" if name != "whole unit" else "")
+        remedy = f" ({Hint('invert', name)})" if name != "whole unit" else ""
+        return Change(f"axes of the {name} are inverted{remedy}", f"{SHORT[name]} inverted")
     words = axes_words(AXES[k])
     option = words.replace("−", "-").replace(" ", "")
     hint = Hint("axes", option if name == "whole unit" else {name: option})
-    return f"axes of the {name} should be read as ({words}) ({hint})"
+    return Change(f"axes of the {name} should be read as ({words}) ({hint})", f"{SHORT[name]} ({words})")
 
 
 # --------------------------------------------------------------------------------------------------------------- without a reference
@@ -714,7 +714,7 @@ def _without_reference(recording: Recording, sensors: _Sensors, step: int) -> _E
 
 
 @functools.cache
-def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray], list[tuple[str, ...]]]:
+def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray], list[tuple[Change, ...]]]:
     """Return explanations with one wrong sensor: which attitude by the gyro, which axes of each vector, and the changes."""
     rows = []
     place = {matrix.tobytes(): k for k, matrix in enumerate(AXES)}
