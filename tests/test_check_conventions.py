@@ -252,6 +252,7 @@ def test_an_acceleration_without_gravity_is_named():
         assert examination.verdict == "cannot tell"
         assert "is not gravity" in " ".join(examination.warnings)
         assert "axes" not in " ".join(examination.warnings)
+        assert "fits as well" not in " ".join(examination.notes)
 
 
 def test_rates_beyond_any_gyro_are_doubted():

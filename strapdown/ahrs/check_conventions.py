@@ -259,9 +259,9 @@ def examine(recording: Recording) -> Examination:
     else:
         result = _concluded(recording.source, explanations, unit_changes, notes)
         if stuck:
-            result = replace(result, verdict="cannot tell", reason="a sensor is stuck; see the warning")
+            result = replace(result, verdict="cannot tell", reason="a sensor is stuck; see the warning", notes=notes)
         elif not doubts and (doubts := _without_gravity(result.candidates[0], sensors.get("accelerometer"))):
-            result = replace(result, verdict="cannot tell", reason="the accelerometer shows no gravity")
+            result = replace(result, verdict="cannot tell", reason="the accelerometer shows no gravity", notes=notes)
             unsaid = []
     if upright and result.verdict == "as declared":
         result = replace(result, verdict="cannot tell", reason="the sensors agree; see the warning on their sign")
