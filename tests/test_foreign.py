@@ -684,8 +684,8 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         ("time_s,qw,qx,qy,qz,q_w", "1,1,0,0,0,1", "has the same meaning"),
         (
             "time_s,qw,qx,qy,qz,roll_sigma_deg,pitch_sigma_deg,yaw_sigma_deg",
-            "1,1,0,0,0,3,0,3",
-            "σ of pitch in data row 1 is not",
+            "1,,,,,0,0,0\n2,1,0,0,0,3,0,3",  # a row without an attitude is not read
+            "σ of pitch in data row 2 is not above zero; remove the row",
         ),
         ("time_s,qw,qx,qy,qz", "3,,,,\n4,1,0,0,0", "row 4 is not after the one before"),
     ],

@@ -237,8 +237,9 @@ def _table(path: Path) -> Attitudes:
         for name, group in places.items()
     }
     q = np.stack([columns["q"][axis] for axis in "wxyz"], axis=1)
-    known = np.isfinite(q).all(axis=1)
-    covariance, angles, remarks = _covariance(path.name, columns, len(stamps))
+    rows = np.flatnonzero(np.isfinite(q).all(axis=1))  # the others are not read
+    columns = {name: {key: values[rows] for key, values in group.items()} for name, group in columns.items()}
+    covariance, angles, remarks = _covariance(path.name, columns, rows)
     bias = None
     if set(columns["bias"]) == set("xyz"):
         bias = np.stack([columns["bias"][axis] for axis in "xyz"], axis=1)
@@ -246,17 +247,17 @@ def _table(path: Path) -> Attitudes:
         covariance = covariance[:, :3, :3]
     if covariance is not None and covariance.shape[1] == 3:
         bias = None  # its covariance is not given
-    back = np.diff(stamps[known]) <= 0
+    back = np.diff(stamps[rows]) <= 0
     if back.any():
-        row = int(np.flatnonzero(known)[1:][back][0]) + 1
+        row = rows[1:][back][0] + 1
         raise InputError(f"{path.name}: row {row} is not after the one before; sort the rows, or check the time's unit")
     return Attitudes(
         source=path.name,
-        stamps_ns=stamps[known],
-        attitude=_unit(path.name, q[known]),
-        covariance=None if covariance is None else covariance[known],
+        stamps_ns=stamps[rows],
+        attitude=_unit(path.name, q[rows]),
+        covariance=covariance,
         error_frame=angles or frame,
-        bias=None if bias is None else bias[known],
+        bias=bias,
         remarks=tuple(remarks),
     )
 
@@ -297,12 +298,14 @@ def _counted_ns(file: str, time: Array, unit: float) -> NDArray[np.int64]:
     return counts.astype(np.int64)
 
 
-def _covariance(name: str, columns: Mapping[str, Mapping[str, Array]], m: int) -> tuple[Array | None, str, list[str]]:
-    """Return the covariance from the columns, the kind of angles it describes (empty if not named), and remarks."""
+def _covariance(
+    name: str, columns: Mapping[str, Mapping[str, Array]], rows: NDArray[np.int64]
+) -> tuple[Array | None, str, list[str]]:
+    """Return the covariance from the columns of these rows, the kind of angles it describes (empty if not named), and remarks."""
     cov_columns = columns["cov"]
     if cov_columns:
         size = 6 if any("b" in key for key in cov_columns) else 3
-        P = np.full((m, size, size), np.nan)
+        P = np.full((len(rows), size, size), np.nan)
         for key, value in cov_columns.items():
             i, j = (STATES.index(state) for state in key.split())
             P[:, i, j] = P[:, j, i] = value
@@ -314,9 +317,8 @@ def _covariance(name: str, columns: Mapping[str, Mapping[str, Array]], m: int) -
         if set(columns[group]) == set(axes):
             sigma = np.stack([columns[group][axis] for axis in axes], axis=1)
             for row, k in np.argwhere(sigma <= 0.0):
-                raise InputError(
-                    f"{name}: σ of {axes[k]} in data row {row + 1} is not above zero; leave it empty if unknown"
-                )
+                place = f"{name}: σ of {axes[k]} in data row {rows[row] + 1}"
+                raise InputError(f"{place} is not above zero; remove the row, or all columns of σ")
             words = "The file has σ and no covariance: errors of different axes are treated as independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
     words = (
