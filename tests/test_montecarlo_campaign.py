@@ -339,6 +339,7 @@ def test_the_command_computes_prints_and_writes(command, monkeypatch):
     assert report["runs"] == 30
     assert report["digest"] == held.plan.digest
     assert report["anees"]["attitude"] == pytest.approx(held.statistics.anees[4:, 1].mean(), rel=0.2)
+    assert json.loads(json.dumps(held.summary())) == report
     expected = montecarlo.summary(held.statistics)
     assert (report["judgement"]["verdict"], report["consistent"]) == ("cannot tell", False)
     assert {name: report[name] for name in expected} == json.loads(json.dumps(expected))

@@ -211,6 +211,7 @@ def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
         runs = montecarlo.campaign.Campaign(plan=plan, machine="scalar", reason="", chunk=1, runs=1, statistics=None)
         said = " ".join([*estimate.remarks, *montecarlo.campaign.words(runs, sd.check(estimate))])
         assert "states=True" not in said  # which has none for outliers
+        assert "anees" not in runs.summary()  # no run is finished
 
 
 def test_smoothing_by_a_setup_is_that_of_the_smoother():

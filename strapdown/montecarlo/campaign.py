@@ -96,20 +96,20 @@ class Campaign(Listed):
             return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
-    def summary(self, judgement: Judgement) -> dict[str, Any]:
-        """Return plan, provenance, verdict and statistics of the finished runs as plain values for JSON.
+    def summary(self, judgement: Judgement | None = None) -> dict[str, Any]:
+        """Return plan, provenance, verdict and statistics as plain values for JSON.
 
         Parameters
         ----------
-        judgement : Judgement
-            Verdict on them.
+        judgement : Judgement, optional
+            Verdict on the finished runs, if known.
 
         Returns
         -------
         dict
-            Plan with its digest, engine, chunk size, version and time, and what :func:`strapdown.montecarlo.summary` returns.
+            Plan, digest, engine, chunk size, version, time; if runs are finished, also :func:`strapdown.montecarlo.summary`.
         """
-        assert self.statistics is not None
+        statistics, bound = self.statistics, verdicts.bound_of(self.plan)
         return {
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
@@ -118,7 +118,7 @@ class Campaign(Listed):
             "chunk": self.chunk,
             "version": self.version,
             "seconds": self.seconds,
-            **verdicts.summary(self.statistics, judgement=judgement, bound=verdicts.bound_of(self.plan)),
+            **({} if statistics is None else verdicts.summary(statistics, judgement=judgement, bound=bound)),
         }
 
     @property
@@ -141,16 +141,15 @@ class Campaign(Listed):
 
 def words(campaign: Campaign, judgement: Judgement) -> list[str]:
     """Return extent and verdict of a campaign, and what would make the verdict clearer."""
-    body, own = campaign.plan.scenario, campaign.plan.setup
+    scenario, filter_setup = campaign.plan.scenario, campaign.plan.setup
     sentences = [f"{campaign.extent}, computed in {campaign.seconds:.3g} s.", judgement.words]
     if judgement.verdict == "cannot tell":
         sentences.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
-    plain = own.states is None and own.estimator == setup.MEKF
-    if judgement.unmodelled and plain and setup.has_states_for(body.gyro, body.sensors, body.gravity_f):
+    mekf, specified = filter_setup.estimator == setup.MEKF, (scenario.gyro, scenario.sensors, scenario.gravity_f)
+    if judgement.unmodelled and mekf and filter_setup.states is None and setup.has_states_for(*specified):
         sentences.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
-    one_sample = own.estimator == setup.MEKF and own.integration.name == "one-sample"
-    drifts = one_sample and setup.commutes_badly(scenarios.simulate(body), own.process_noise.angle_random_walk)
-    if drifts and judgement.verdict != "consistent":
+    doubtful = judgement.verdict != "consistent" and mekf and filter_setup.integration.name == "one-sample"
+    if doubtful and setup.commutes_badly(scenarios.simulate(scenario), filter_setup.process_noise.angle_random_walk):
         sentences.append(
             "One-sample integration drifts in this motion (coning) by more than the gyro's noise explains; give a filter with another "
             "integration, such as matched-1-8-8."
