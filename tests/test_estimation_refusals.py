@@ -333,10 +333,9 @@ TABLE = [
     (sd.covariance_analysis, {"scenario": "spin", "consider": {"scale_factor": 1e-4}}, "not of class Consider"),
     (sd.monte_carlo, {"scenario": "spin", "dispersions": {"bias_sigma": 1.0}}, "not of class Dispersions"),
     (lambda: replace(scenarios.load_scenario("spin"), gyro=1e-4), {}, "gyro is 0.0001, not of class GyroSpec"),
-    (
-        sd.tune,
-        {"sources": RECORD, "setup": SETUP, "free": "gyro.arw"},
-        "free is 'gyro.arw', not of class list or tuple",
+    *(
+        (sd.tune, {"sources": RECORD, "setup": SETUP, "free": free}, f"free is {free!r}, not of class list or tuple")
+        for free in ("gyro.arw", "")
     ),
     (
         lambda: FilterSetup.for_scenario(replace(scenarios.load_scenario("coning"), gyro=GyroSpec()), states=False),

@@ -87,7 +87,7 @@ def tune(
     from strapdown import tuning
 
     count("seed", seed, minimum=0)
-    instance("free", free or (), (list, tuple), "give a list of names")
+    instance("free", () if free is None else free, (list, tuple), "give a list of names")
     threads = count("threads", threads if threads is not None else os.cpu_count() or 1)
     own, by_name = setup is not None, _by_name(sources)
     setup, cases, remarks = _cases(by_name, setup, states)
