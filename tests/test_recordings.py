@@ -301,8 +301,9 @@ def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
 
 
 def test_a_row_for_each_sensor_is_one_recording(csv):
-    rows = [f"{0.01 * k:.2f},{k},0,0,,,\n{0.01 * k + 0.004:.3f},,,,{k},2,9" for k in range(4)]
-    recording = read(csv(rows=rows))
+    rows = [f"{0.01 * k:.2f},{k},0,0,,,,\n{0.01 * k + 0.004:.3f},,,,{k},2,9,2{k}" for k in range(4)]
+    recording = read(csv(f"{HEADER},temperature", rows))
+    np.testing.assert_array_equal(recording.temperature, [20.0, 21.0, 22.0, 23.0])
     np.testing.assert_array_equal(recording.rate[:, 0], range(4))
     np.testing.assert_array_equal(recording.specific_force, [[k, 2, 9] for k in range(4)])
 

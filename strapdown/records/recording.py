@@ -224,7 +224,7 @@ class Recording(Listed):
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
     """Return a recording of the rows that have a gyro sample and do not repeat the row before, with the stamps of the other rows.
 
-    A log may have a row for each sensor: samples of vectors in rows without the gyro's go to the nearest row with one that lacks them.
+    A log may have a row for each sensor: vectors and temperatures in rows without the gyro go to the nearest row with it that lacks them.
     """
     same = np.diff(time) == 0.0
     if same.any() and np.mean(same) >= FEW_REPEATED:
@@ -244,9 +244,9 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
             )
         stamps = increasing(f"{source}: time", columns["time"])
         moved = {}
-        for name in ("specific_force", "magnetic_field"):
+        for name in ("specific_force", "magnetic_field", "temperature"):
             if (values := columns.get(name)) is not None and len(values) == len(known):
-                there = ~np.isnan(values).any(axis=1)
+                there = ~np.isnan(values.reshape(len(values), -1)).any(axis=1)
                 moved[name] = at_nearest(stamps[known], stamps[there], values[there])[0]
         columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known]}
     return Recording(source=source, **columns)
