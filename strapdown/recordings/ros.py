@@ -175,8 +175,8 @@ def topic_of(name: str, topics: Mapping[str, Topic], topic: str, what: str, kind
 def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str | None:
     """Return the topic of a kind that belongs to one of the inertial units: the only one of its namespace or, failing that, of none's."""
     space = {name: name.rpartition("/")[0] + "/" for name in units if "/" in name[1:]}
-    own = [t for t in candidates if unit in space and t.name.startswith(space[unit])]
-    near = own or [t for t in candidates if not t.name.startswith(tuple(space.values()))]
+    nearest = {t: max((s for s in space.values() if t.name.startswith(s)), key=len, default="") for t in candidates}
+    near = [t for t in candidates if nearest[t] == space.get(unit)] or [t for t in candidates if not nearest[t]]
     if len(near) == 1 or not candidates:
         return near[0] if near else None
     names = ", ".join(t.name for t in candidates)
