@@ -61,7 +61,7 @@ def numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
     return array(reading.place(group, name), reading.numbers(group, name), shape)
 
 
-def each(place: str, value: Array, good: Any, remedy: str) -> Array:
+def need_each(place: str, value: Array, good: Any, remedy: str) -> Array:
     """Return values, checked entry by entry; the error names the first that is not good."""
     if not np.all(good):
         index = tuple(int(i) for i in np.argwhere(~good)[0])
@@ -75,7 +75,7 @@ def above_zero(place: str, variance: Array) -> Array:
         ", and a variance must be greater than zero; the file is damaged, or a sensor had no noise: give each a sigma above zero and "
         "repeat the estimate"
     )
-    return each(place, variance, variance > 0.0, remedy)
+    return need_each(place, variance, variance > 0.0, remedy)
 
 
 def parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:

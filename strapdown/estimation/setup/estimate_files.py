@@ -13,7 +13,7 @@ from strapdown.files import reading, set_attributes
 from strapdown.recordings.recordfiles import origin_attributes, origin_of
 from strapdown.records import ErrorStateEstimate, Estimate, Event, Innovations, Truth, put, result_file
 from strapdown.records.estimate import EVENT_KINDS
-from strapdown.records.result_files import above_zero, each, innovations, numbers, parts
+from strapdown.records.result_files import above_zero, innovations, need_each, numbers, parts
 
 KIND = "strapdown estimate"
 """The attribute ``kind`` of an estimate's file."""
@@ -164,7 +164,7 @@ def _biases(group: Any, name: str, rows: int) -> Array:
         " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
         "the gyro's unit"
     )
-    return each(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
+    return need_each(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:

@@ -69,7 +69,7 @@ def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth
         standard_error=error,
         unit="rad/s",
         gain=max(gain, better),
-        log_p=min(log_p(gain, 1), -0.5 * better, 0.0),
+        log_p=min(log_p(gain, 1), -0.5 * better),
         words=(
             f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h on average, estimated as gyro bias; "
             f"the filter's σ in this direction is {sigma / DEGREE_PER_HOUR:.3g} °/h"
