@@ -240,7 +240,7 @@ def test_a_gyro_alone_is_refused():
 def test_a_force_in_no_unit_is_noted():
     recording = simulated(9)
     examination = check_conventions.examine(replace(recording, specific_force=recording.specific_force / 3.0))
-    assert any("fits neither" in doubt for doubt in examination.doubts)
+    assert any("is not gravity in" in doubt for doubt in examination.doubts)
 
 
 def test_an_acceleration_without_gravity_is_named():
@@ -308,7 +308,7 @@ def test_doctor_ends_with_the_status_of_the_verdict(run, tmp_path, mistake, stat
     [
         ({}, ""),
         ({"specific_force": np.eye(3) / STANDARD_GRAVITY}, "`units={'accelerometer': 'g'}`"),
-        ({"specific_force": np.eye(3) / 3.0}, "fits neither m/s² nor g"),
+        ({"specific_force": np.eye(3) / 3.0}, "is not gravity in m/s², g, mm/s² or mg"),
         ({"rate": np.eye(3) * 180.0 / np.pi}, "`units={'gyro': 'deg/s'}`"),
         ({"rate": np.diag([-1.0, 1.0, 1.0])}, "axes of the gyro should be read as (−x, y, z)"),
         ({"magnetic_field": np.diag([-1.0, 1.0, 1.0])}, "axes of the magnetometer should be read as ("),

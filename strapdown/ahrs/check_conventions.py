@@ -401,7 +401,7 @@ def _force_unit(force: _Sensor) -> tuple[tuple[Change, ...], list[str]]:
         return (), ["the accelerometer reads zero throughout"]
     change, gravity = _gravity(strength)
     if abs(math.log(strength / gravity)) > 0.5 + float(np.std(force.size)) / strength:
-        return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g; gravity must be in it"]
+        return (), [f"the median specific force, {strength:.3g} m/s², is not gravity in m/s², g, mm/s² or mg"]
     return (change,) * (change != AS_DECLARED), []
 
 
