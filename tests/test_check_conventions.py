@@ -231,6 +231,13 @@ def test_missing_rows_are_left_out():
         assert words in check_conventions.examine(wrong).reason, name
 
 
+def test_a_magnetometer_slower_than_the_gyro_is_checked():
+    recording = simulated(9, reference=False)
+    field = np.full_like(recording.magnetic_field, np.nan)
+    field[1::4] = recording.magnetic_field[1::4, [1, 0, 2]] * [1.0, -1.0, 1.0]
+    assert "axes of the magnetometer" in check_conventions.examine(replace(recording, magnetic_field=field)).reason
+
+
 def test_a_gyro_alone_is_refused():
     bare = replace(simulated(0, duration=2.0, reference=False), specific_force=None, magnetic_field=None)
     with pytest.raises(InputError, match=r"has only a gyro; .* name its columns, as in `columns={'ax': 'NAME'}`"):

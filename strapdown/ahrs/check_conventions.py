@@ -118,11 +118,7 @@ FASTEST = 4000.0 * DEGREE
 
 def axes_words(matrix: Array) -> str:
     """Return a signed permutation in words, such as "x, −z, y"."""
-    names = []
-    for row in matrix:
-        k = int(np.argmax(np.abs(row)))
-        names.append(f"{'−' if row[k] < 0.0 else ''}{'xyz'[k]}")
-    return ", ".join(names)
+    return ", ".join(("−" if np.sum(row) < 0.0 else "") + "xyz"[np.argmax(np.abs(row))] for row in matrix)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,9 +296,8 @@ def _concluded(source: str, tried: _Explanations, sure: tuple[Change, ...], note
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best[0].misfit.values()) > POOR:
         verdict = "cannot tell"
-        reason = "no explanation tried fits; misfits of the best one: " + ", ".join(
-            f"{name} {value:.2f}" for name, value in best[0].misfit.items()
-        )
+        misfits = ", ".join(f"{name} {value:.2f}" for name, value in best[0].misfit.items())
+        reason = f"no explanation tried fits; misfits of the best one: {misfits}"
     elif len(equal) > MAX_EQUAL:
         verdict = "cannot tell"
         reason = f"{len(equal)} other explanations fit as well as “{words(named)}”: the rotation is too small, or about one axis only"
@@ -487,11 +482,16 @@ _Sensors = Mapping[str, _Sensor]
 
 
 def _sensor(vectors: Array, step: int) -> _Sensor:
-    """Return every ``step``-th sample of a vector."""
-    size = lengths(vectors[::step])
-    known = np.isfinite(size)
-    size = size if known.all() else size[known]
-    return _Sensor(vectors[::step], known, size, median(size))
+    """Return the samples of a vector in every ``step``-th row, or within a step after it if the sensor is slower than the gyro."""
+    rows = np.arange(0, len(vectors), step)
+    if np.isnan(vectors[rows]).any():
+        known = np.append(np.flatnonzero(np.isfinite(vectors).all(axis=1)), len(vectors) + step)
+        later = known[np.searchsorted(known, rows)]
+        rows = np.where(later < rows + step, later, rows)
+    size = lengths(vectors[rows])
+    there = np.isfinite(size)
+    size = size if there.all() else size[there]
+    return _Sensor(vectors[rows], there, size, median(size))
 
 
 class _Windows(NamedTuple):
