@@ -113,8 +113,8 @@ def table(content: Table) -> str:
         rows.append(f"<tr>{cells}</tr>")
     frame = 'class="scroll" tabindex="0"' if any(kinds) else 'class="wrap"'  # the arrow keys scroll what has the focus
     notes = (paragraph(note, faint=True) for note in content.notes)
-    cells = "\n".join([f"<thead><tr>{head.replace(', ', '<br>')}</tr></thead><tbody>", *rows])
-    return "\n".join([f"<div {frame}><table>{cells}</tbody></table></div>", *notes])
+    body = "\n".join([f"<thead><tr>{head.replace(', ', '<br>')}</tr></thead><tbody>", *rows, "</tbody>"])
+    return "\n".join([f"<div {frame}><table>{body}</table></div>", *notes])
 
 
 def listed(content: Table) -> str:
