@@ -180,7 +180,7 @@ def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str
     if len(near) == 1 or not candidates:
         return near[0] if near else None
     names = ", ".join(t.name for t in candidates)
-    return f"None of {names} was read, because it is ambiguous which of them belongs to {unit}."
+    return f"None of {names} was read, because it is ambiguous which of them, if any, belongs to {unit}."
 
 
 def _decoded(
