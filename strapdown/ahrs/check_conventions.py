@@ -243,8 +243,7 @@ def examine(recording: Recording) -> Examination:
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
     stuck = stuck_words(recording)
     doubts += _too_fast(recording) + stuck
-    # Gravity alone shows it, whatever the turns do.
-    unsaid = [f"as it seems, {change.words}" for change in unit_changes]
+    unsaid = [f"as it seems, {change.words}" for change in unit_changes]  # gravity alone shows it, whatever the turns
     upright = at_rest(recording)
     explained = _without_reference if recording.true_attitude is None else _with_reference
     explanations = explained(recording, sensors, step)
