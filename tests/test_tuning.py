@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 import time
 import types
 
@@ -429,7 +430,9 @@ def test_priors_from_a_specification_match_its_noise():
 def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     simulated_case = case()
     off = tuning.with_values(BELIEVED, {"gyro.arw": 3.0 * ARW})
-    fit = tuning.fit(tuning.likelihood([simulated_case], off, ["gyro.arw", "star 2.sigma", "initial.bias"]), starts=1)
+    objective = tuning.likelihood([simulated_case], off, ["gyro.arw", "star 2.sigma", "initial.bias"])
+    fit = tuning.fit(objective, starts=1, progress=lambda words: None)
+    assert str(pickle.loads(pickle.dumps(fit))) == str(fit)
     assert fit.setup.process_noise.angle_random_walk == pytest.approx(fit["gyro.arw"].value)
     assert fit.setup.process_noise.rate_random_walk == RRW
     assert fit.setup.sigma == {"star 2": pytest.approx(fit["star 2.sigma"].value)}

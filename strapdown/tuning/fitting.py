@@ -425,7 +425,7 @@ def fit(
         raise InputError(f"factor is {factor}; it must be greater than 1")
     points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *objective.limits)
     stage = _Stage(progress)
-    objective = replace(objective, evaluated=stage.evaluated)
+    silent, objective = objective, replace(objective, evaluated=stage.evaluated)
 
     optima = stage.each("searches", lambda point: search(objective, point, known), points, threads)
     best = _best(optima)
@@ -452,7 +452,7 @@ def fit(
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
-        objective=objective,
+        objective=silent,
     )
 
 

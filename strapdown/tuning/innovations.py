@@ -64,7 +64,6 @@ class Prepared:
     """The same with the σ of the starting point, and the filter there."""
     filter: tuple[Model, State]
     """Model of the error states, whose structure is the same at every point, and initial state with them, at the starting point."""
-    kernels: ModuleType
     cuts: Array
     used: np.ndarray
     """Which parts are used (parts,), bool."""
@@ -75,6 +74,11 @@ class Prepared:
     """Change of temperature at the edges since the start (n + 1,), K; (0,) without slopes of the gyro's bias."""
     driven: np.ndarray
     """Places in the model's numbers of that change."""
+
+    @property
+    def kernels(self) -> ModuleType:
+        """Kernels of the filter; no field, because a module cannot be pickled."""
+        return machine.instance(filter, STRUCTURE=self.filter[0].structure, LANES=WIDTH, PARAMETERS=True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -381,7 +385,6 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
         steps=steps,
         problem=prepared,
         filter=(model, state),
-        kernels=machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH, PARAMETERS=True),
         cuts=np.array([*before, *inner, *after]),
         used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
         lengths=forward.divisors(

@@ -134,8 +134,8 @@ class Objective:
     """Number of time spans of each record with separate gradients."""
     threads: int = 1
     spacing: float = 0.0
-    evaluated: Callable[[], object] = field(default=lambda: None, repr=False)
-    """Called after each evaluation of a search."""
+    evaluated: Callable[[], object] = field(default=int, repr=False)
+    """Called after each evaluation of a search. Default: no effect, and can be pickled, unlike a lambda."""
     composite: ClassVar[bool] = False
     """Whether its curvature is not an information matrix, so standard errors are from the scatter of its gradient."""
 
