@@ -243,6 +243,7 @@ def test_the_power_of_a_process_at_its_own_frequencies_is_that_of_its_model():
     [
         (lambda recording: [], "at least one recording"),
         (lambda recording: [recording.time], "recordings"),
+        (lambda recording: {"time": recording.time}, "recordings is {.*give recordings, as read returns them"),
         (lambda recording: dataclasses.replace(recording, specific_force=None), "no accelerometer"),
         (lambda recording: [recording, dataclasses.replace(recording, magnetic_unit="mG")], "one unit for all"),
         (lambda recording: hand_held.simulated(1, 0, 3.0), "needs at least 10 s"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def calibrate(
     >>> print(unit)  # doctest: +SKIP
     >>> estimate = sd.estimate(sd.read("walk.csv"), calibration=unit)  # doctest: +SKIP
     """
-    used = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    used: list[Any] = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
     if not used:
         raise InputError("recordings is empty; give at least one recording")
     for recording in used:
