@@ -482,7 +482,7 @@ def test_units_convert(name, unit, factor):
         ({"arw": "0.15 1/sqrt(h)"}, "radian / second"),
         ({"arw": "0.15 bananas"}, "bananas"),
         ({"arw": "deg//h"}, "not a quantity"),
-        ({"arw": 0.15}, "as text with its unit"),
+        ({"arw": 0.15}, r"as text with its unit, such as deg/sqrt\(h\) or deg/s/sqrt\(Hz\)$"),
         ({"bandwidth": "50 rad/s"}, "bandwidth.*Hz"),
         ({"awr": "1 deg/h"}, "did you mean 'arw'"),
         ({"quantization": "1 arcsec", "angle_resolution": "1 arcsec"}, "the same quantity"),

@@ -49,11 +49,11 @@ def _registry() -> Any:
     return pint.UnitRegistry()
 
 
-def parse(name: str, text: str, wanted: str, example: str = "") -> float:
+def parse(name: str, text: str, wanted: str, example: str) -> float:
     """Return a quantity given as text, in the unit ``wanted``; raise an error for another dimension."""
     registry = _registry()
     if not isinstance(text, str):
-        raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example!r}")
+        raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example}")
     plain = (
         text.replace("°", " deg")
         .replace("√Hz", "sqrt(Hz)")
@@ -68,13 +68,13 @@ def parse(name: str, text: str, wanted: str, example: str = "") -> float:
         units = quantity.to_root_units().units
     except Exception as error:  # pint raises any of Python's exceptions for a text that is no expression
         raise InputError(
-            f"{name} is {text!r}, which is not a quantity with a unit ({error}); write for example {example or wanted!r}"
+            f"{name} is {text!r}, which is not a quantity with a unit ({error}); write a number with its unit, such as {example}"
         ) from None
     needed = registry.Quantity(1.0, wanted).to_root_units().units
     # The radian has no dimension, so without "deg" a number would be read as radians: compare units, not only dimensions.
     if units != needed:
         have = "no unit" if units == registry.dimensionless else f"in {units}"
-        raise InputError(f"{name} is {text!r} ({have}); give a quantity in {needed}, such as {example or wanted!r}")
+        raise InputError(f"{name} is {text!r} ({have}); give a quantity in {needed}, such as {example}")
     return float(quantity.to(wanted).magnitude)
 
 
