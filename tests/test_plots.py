@@ -159,6 +159,8 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, mo
     bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
     np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], bounds)
     nees = plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias").lines[0].get_ydata()
+    with pytest.raises(InputError, match="did you mean 'attitude'"):
+        plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "atitude")
     np.testing.assert_allclose(nees, statistics.nees_sum[:, 2] / (3.0 * 24.0))
     innovations = next(iter(run[0].innovations.values()))
     nis = np.sum(innovations.whitened**2, axis=1) / 2.0
@@ -238,6 +240,8 @@ def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
+    with pytest.raises(InputError, match="truth is None"):
+        plots.error_overview(estimate, None)
     figure = plots.error_overview(estimate, truth)
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     for state, ax in enumerate(np.reshape(figure.axes, (3, 2)).T.ravel()):

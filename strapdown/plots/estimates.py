@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array
+from strapdown.checks import Array, instance
 from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
@@ -224,6 +224,7 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     Figure
         Attitude errors as a rotation vector in body axes, ``q_true = q_est ⊗ exp(δθ)``.
     """
+    instance("truth", truth, Truth, "give that of the record, record.truth")
     figure, axes = style.new_figure(3, 2, size=(10.0, 6.6), sharex=True)
     error = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     settled = slice(len(estimate.time) // 20, None)

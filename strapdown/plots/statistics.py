@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from strapdown.checks import Array
+from strapdown.checks import Array, one_of
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import COVERED, SUBSETS, judged_epochs
@@ -47,10 +47,11 @@ def nees_over_time(
     Axes
         The axes.
     """
+    state = SUBSETS[one_of("subset", subset, SUBSETS)][0]
     ax = style.axes_or_new(ax)
     ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label=label)
     for k, (name, statistics) in enumerate(named):
-        ax.plot(statistics.time, statistics.anees[:, SUBSETS[subset][0]], label=name, **style.layered(k, len(named)))
+        ax.plot(statistics.time, statistics.anees[:, state], label=name, **style.layered(k, len(named)))
     style.log_scale(ax)
     ax.set_xlabel("time, s")
     ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
