@@ -40,8 +40,8 @@ class LiveAhrs:
     magnetometer : bool, default False
         Whether the samples have a field.
     parameters : AhrsParameters, optional
-        The filter's model of the unit and of its motion, such as ``ahrs.of_motion("vehicle", magnetometer=True)``. Default: that of a unit
-        in the hand.
+        The filter's model of the unit and of its motion, such as ``ahrs.MOTIONS["vehicle"][0]``, without a magnetometer ``[1]``.
+        Default: that of a unit in the hand.
     latency : float, optional
         Delay of the samples, s, as for :func:`strapdown.estimate`. Default: half the interval.
 
@@ -84,7 +84,7 @@ class LiveAhrs:
             raise InputError(f"interval is {interval:g} s; give that of the samples, 1e-6 to 1 s: 0.01 for 100 Hz")
         instance("magnetometer", magnetometer, bool, "give True or False")
         if parameters is not None:
-            instance("parameters", parameters, AhrsParameters, 'such as ahrs.of_motion("vehicle", magnetometer=True)')
+            instance("parameters", parameters, AhrsParameters, 'such as ahrs.MOTIONS["vehicle"][0]')
         self.magnetometer = magnetometer
         self.parameters = parameters or of_motion("hand", magnetometer=magnetometer)
         late = 0.5 * self.interval if latency is None else non_negative("latency", latency, unit="s")

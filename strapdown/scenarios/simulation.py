@@ -30,7 +30,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     seed : int, optional
         Seed of the random numbers. Default: that of the scenario.
     run : int, default 0
-        Number of the run; runs with the same seed are independent.
+        Number of the run; runs with the same seed are independent. Those of a Monte Carlo: :func:`strapdown.montecarlo.replay`.
 
     Returns
     -------

@@ -114,7 +114,8 @@ def write(
         The file of a record contains its origin; a scenario that includes your own Python functions or classes is omitted.
     path : path
         The suffix selects the format: ``.h5`` holds a record or an estimate completely, with its filter, origin and truth, ``.toml`` a
-        scenario or a filter setup; :data:`strapdown.recordings.FORMATS` lists the others for recordings and estimates.
+        scenario (read by :func:`strapdown.scenarios.load_scenario`) or a filter setup (:func:`strapdown.estimation.setup.read_setup`);
+        :data:`strapdown.recordings.FORMATS` lists the others for recordings and estimates.
     **options
         Options of the format: for an estimate as a table ``sequence`` and ``frame`` (:meth:`strapdown.records.Estimate.table`), and
         ``recording``, from which it was made, whose samples a ROS bag needs.
