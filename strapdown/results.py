@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["ByValue", "Column", "Listed", "Table", "equal", "figure"]
+__all__ = ["ByValue", "Column", "Listed", "Table", "default_of", "equal", "figure", "not_default"]
 
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
@@ -212,6 +212,8 @@ def figure(value: float | None, digits: int = 4) -> str:
 class ByValue:
     """Base of a frozen dataclass, declared with ``eq=False``, whose instances are equal if all their fields are (:func:`equal`).
 
+    It prints as the fields that differ from their defaults, large arrays as their shapes.
+
     Examples
     --------
     >>> import numpy as np
@@ -219,20 +221,46 @@ class ByValue:
     >>> @dataclass(frozen=True, eq=False)
     ... class Course(ByValue):
     ...     values: np.ndarray
+    ...     step: float = 1.0
     >>> Course(np.array([1.0, np.nan])) == Course(np.array([1.0, np.nan]))
     True
+    >>> Course(np.zeros((100, 3)))
+    Course(values=<array (100, 3)>)
     """
+
+    def __init_subclass__(cls) -> None:
+        cls.__repr__ = vars(cls).get("__repr__", ByValue.__repr__)  # type: ignore[method-assign]  # not that of a dataclass
+        super().__init_subclass__()
+
+    def __repr__(self) -> str:
+        def words(value: Any) -> str:
+            return f"<array {value.shape}>" if isinstance(value, np.ndarray) and value.size > 9 else repr(value)
+
+        fields = [f"{name}={words(value)}" for name, value in not_default(self).items()]
+        return f"{type(self).__name__}({', '.join(fields)})"
 
     def __eq__(self, other: object) -> bool:
         """Compare all fields, arrays element by element."""
         if not (isinstance(other, type(self)) or isinstance(self, type(other))):
             return NotImplemented
-        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        names = [field.name for field in dataclasses.fields(self) if field.compare]  # type: ignore[arg-type]
         return self is other or all(equal(getattr(self, name), getattr(other, name)) for name in names)
 
     def __hash__(self) -> int:
         """Return a hash that equal instances share: that of the names of the fields, since arrays and mappings have none."""
         return hash(tuple(field.name for field in dataclasses.fields(self)))  # type: ignore[arg-type]
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """Return the default of a field, ``MISSING`` if there is none."""
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+def not_default(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass that differ from their defaults; of any other object none."""
+    declared = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    fields = {field: getattr(value, field.name) for field in declared}
+    return {field.name: content for field, content in fields.items() if not equal(content, default_of(field))}
 
 
 def equal(first: Any, other: Any) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 import strapdown
 from strapdown import estimation, gyro, motion, scenarios, tuning, vectors
-from strapdown.estimation import setup
+from strapdown.estimation import error_states, setup
 from strapdown.motion.orbit import CircularOrbit
 from strapdown.results import equal
 from strapdown.tuning.diagnosis import Cause
@@ -114,6 +114,29 @@ def test_specifications_are_compared_by_value():
     assert filter_setup == dataclasses.replace(filter_setup)
     assert hash(filter_setup) == hash(dataclasses.replace(filter_setup))
     assert filter_setup != dataclasses.replace(filter_setup, sigma={"star": 1e-3})
+
+
+def test_a_record_is_equal_to_its_file_and_its_parts_print_in_a_line(tmp_path):
+    time = np.arange(8.0)
+    attitudes = motion.ConstantRate(rate=np.array([0.0, 0.1, 0.0])).attitude(time)
+    star = vectors.VectorSensor(name="star", reference_f=np.array([0.0, 0.0, 1.0]), sigma=1e-3, rate=10.0)
+    scenario = scenarios.Scenario(
+        motion=motion.SampledAttitude(time=time, attitudes=attitudes),
+        gyro=gyro.GyroSpec(angle_random_walk=1e-4),
+        sensors=(star,),
+        rate=10.0,
+        duration=5.0,
+    )
+    record = scenarios.simulate(scenario)
+    assert strapdown.read(strapdown.write(record, tmp_path / "record.h5")) == record
+    assert record != dataclasses.replace(record, increments=record.increments + 1e-9)
+    assert repr(scenario) == (
+        "Scenario(motion=SampledAttitude(time=array([0., 1., 2., 3., 4., 5., 6., 7.]), attitudes=<array (8, 4)>), "
+        "gyro=GyroSpec(angle_random_walk=0.0001), sensors=(VectorSensor(name='star', rate=10.0, "
+        "reference_f=array([0., 0., 1.]), sigma=0.001),), rate=10.0, duration=5.0)"
+    )
+    assert repr(type("Own", (error_states.ErrorStates,), {})()) == "Own()"  # no dataclass
+    assert repr(record.vectors[0]).endswith("time=<array (50,)>, vector_b=<array (50, 3)>, sigma=<array (50,)>)")
 
 
 def test_methods_are_equal_if_function_and_object_are():

@@ -16,7 +16,7 @@ from strapdown.checks import Array, InputError, array, finite
 from strapdown.files import tables, write_text
 from strapdown.records import ErrorStateEstimate
 from strapdown.records.recording import MAGNETIC_UNITS, Recording
-from strapdown.results import Column, Listed, Table
+from strapdown.results import ByValue, Column, Listed, Table
 
 AXES = ("x", "y", "z")
 MILLISECONDS: tables.Choice = (("ms", 1e-3), ("s", 1.0))
@@ -47,7 +47,7 @@ SCALE = {"°/s": np.pi / 180.0, "%": 0.01, "ms": 1e-3}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SensorErrors:
+class SensorErrors(ByValue):
     """Errors of the sensors of one unit, or their standard deviations.
 
     The gyro measures ``(I + M) w + b``, the other sensors the same of specific force and field. The body axes are those of the

@@ -24,6 +24,7 @@ from strapdown.checks import (
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.kernels.measurement import heading_row
 from strapdown.records import ImuRecord
+from strapdown.results import ByValue
 from strapdown.vectors import wahba
 
 LARGEST_NOISE = 1e9
@@ -92,7 +93,7 @@ class GateMemory:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class State:
+class State(ByValue):
     """Attitude, bias and error states of a filter, and the covariance of their errors.
 
     Parameters

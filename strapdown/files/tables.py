@@ -18,6 +18,7 @@ import numpy as np
 from strapdown import units
 from strapdown.checks import Array, InputError, known_keys, numbers
 from strapdown.files import reading
+from strapdown.results import default_of, not_default
 
 Choice = tuple[tuple[str, float], ...]
 """Suffixes of the key and their factors to SI."""
@@ -55,17 +56,10 @@ def keys(form: Form) -> dict[str, tuple[str, float]]:
 def encode(value: Any, form: Form) -> dict[str, Any]:
     """Return a dataclass as a table; fields that are None or equal to their default are left out."""
     table: dict[str, Any] = {}
-    for field in dataclasses.fields(value):
-        content, default = getattr(value, field.name), field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        if field.name in form and content is not None and not _same(content, default):
-            table.update(_entry(field.name, content, form[field.name]))
+    for name, content in not_default(value).items():
+        if name in form and content is not None:
+            table.update(_entry(name, content, form[name]))
     return table
-
-
-def _same(a: Any, b: Any) -> bool:
-    return bool(a == b) if isinstance(a, str) or isinstance(b, str) else np.array_equal(np.asarray(a), np.asarray(b))
 
 
 def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
@@ -127,11 +121,7 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
     """Return ``kind(**fields)`` from a table; the error for a missing field names its key."""
     values = {**decode(table, form, place), **more}
     for field in dataclasses.fields(kind):
-        if (
-            field.default is dataclasses.MISSING
-            and field.default_factory is dataclasses.MISSING
-            and field.name not in values
-        ):
+        if field.name not in values and default_of(field) is dataclasses.MISSING:
             choice = form.get(field.name, PLAIN)
             key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
             raise InputError(f"{place}: {key} is missing; add it")

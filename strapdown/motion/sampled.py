@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,13 @@ from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.protocol import edge_stamps, times
 from strapdown.motion.quadrature import interval_integrals
+from strapdown.results import ByValue
 
 _WIDEST_DEGREES = 170.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SampledAttitude:
+class SampledAttitude(ByValue):
     """Smooth motion through given attitudes: a spline of the quaternions in four dimensions, scaled to the unit sphere.
 
     ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs
@@ -38,8 +39,8 @@ class SampledAttitude:
         Condition at the ends: none, or zero rate (for degree 5 also zero angular acceleration).
     """
 
-    time: Array = field(repr=False)
-    attitudes: Array = field(repr=False)
+    time: Array
+    attitudes: Array
     degree: int = 5
     ends: str = "free"
 

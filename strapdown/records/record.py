@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,12 +113,12 @@ class Origin(ByValue):
     scenario: Any = None
     seed: int | None = None
     run: int | None = None
-    source: str = ""
+    source: str = field(default="", compare=False)
     epoch_ns: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ImuRecord(Listed):
+class ImuRecord(ByValue, Listed):
     """Gyro increments and vector measurements over one run.
 
     Arrays of floats are kept without a copy, to save memory: pass a copy if the buffer is written to afterwards.

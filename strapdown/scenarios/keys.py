@@ -20,7 +20,7 @@ from strapdown.checks import InputError
 from strapdown.files import tables
 from strapdown.gyro import datasheets
 from strapdown.motion import orbit
-from strapdown.results import WIDTH
+from strapdown.results import WIDTH, default_of
 from strapdown.scenarios import toml
 from strapdown.scenarios.scenario import Scenario, Temperature
 
@@ -187,7 +187,7 @@ def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meanin
     suffix, factor = choice[0]
     if si := symbol(choice[-1][0]):  # the unit of the field, which is not that of every key
         meaning = re.sub(rf", {re.escape(si)}(?![\w/√²])", "", meaning, count=1)
-    default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    default = default_of(field)
     kind = _type(hint, default)
     if default is dataclasses.MISSING:
         example = _EXAMPLES[kind]

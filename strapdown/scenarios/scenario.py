@@ -10,6 +10,7 @@ from strapdown import vectors
 from strapdown.checks import Array, InputError, array, count, finite, instance, positive
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Motion
+from strapdown.results import ByValue
 from strapdown.vectors import Sensor
 
 MAX_SAMPLES = 1e9
@@ -48,8 +49,8 @@ class Temperature:
         return np.asarray(self.start + (self.end - self.start) * share)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scenario:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scenario(ByValue):
     """A motion, a gyro and sensors, with sample rate and duration.
 
     Parameters

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import ROUNDING, Array, InputError, array, increasing, instance, numbers, one_of, unit_quaternions
+from strapdown.results import ByValue
 
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
@@ -21,7 +22,7 @@ horizontal part about the fixed z axis; vector, all three components; attitude, 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VectorMeasurements:
+class VectorMeasurements(ByValue):
     """A series of measurements of one sensor.
 
     A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. Its other entries may be NaN too; they
