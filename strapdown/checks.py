@@ -112,6 +112,8 @@ def numbers(name: str, value: ArrayLike, *, allow_nan: bool = False) -> Array:
     """Return ``value`` as a float64 array of any shape; raise an error for text, dates and booleans, which NumPy would convert."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
+    if hasattr(value, "as_quat"):
+        raise InputError(f"{name} is a SciPy Rotation; give rotation.as_quat(scalar_first=True)")
     try:
         raw = np.asarray(_unmasked(name, value, allow_nan))
         held = "True or False" if _truth_value(value) else _NO_NUMBERS.get(raw.dtype.kind, "")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from strapdown import checks
 from strapdown.checks import InputError
@@ -52,6 +53,7 @@ def test_array_passes_what_fits():
         (["1.0", "2.0"], (2,), ("x is not an array of numbers", "text")),
         (np.array([b"1.0"]), (1,), ("text",)),
         ([1.0 + 2.0j, 3.0], (2,), ("x is not an array of numbers", "complex")),
+        (Rotation.identity(), (4,), ("x is a SciPy Rotation; give rotation.as_quat(scalar_first=True)",)),
         (np.array(["2026-01-01"], dtype="datetime64[s]"), (1,), ("dates",)),
     ],
 )
