@@ -715,7 +715,7 @@ RECORD = np.random.default_rng(0).standard_normal(200)
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[0.01]), "taus holds 0.01 s"),
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[1.0, 11.0]), "taus holds 11 s"),
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[]), "empty"),
-        (lambda: allan.allan_deviation(RECORD, 0.1, level=95.0), "level is 95"),
+        (lambda: allan.allan_deviation(RECORD, 0.1, confidence_level=95.0), "confidence_level is 95"),
         (lambda: allan.allan_deviation(RECORD.reshape(4, 50), 0.1), "50 axes"),
         (lambda: allan.allan_deviation([1.0, 2.0], 0.1), "2 samples"),
         (lambda: allan.fit_noise(RECORD[:50], 0.1), "50 samples"),

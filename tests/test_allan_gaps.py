@@ -163,7 +163,10 @@ GAPPY = np.append(np.arange(9.0) % 3, np.nan)
         (allan.fit_noise, np.full(100, np.nan), {}, "at least 64 without a gap are needed"),
         (allan.fit_noise, np.where(np.arange(500) % 50, 1.0, np.nan), {}, "at least 64 without a gap are needed"),
         (allan.fit_noise, np.where(np.arange(500) == 250, np.nan, 1.0), {}, "axis 0, has no noise"),
-        *((allan.allan_deviation, GAPPY, {"level": level}, "level is ") for level in (0.5, 1.0, np.nan)),
+        *(
+            (allan.allan_deviation, GAPPY, {"confidence_level": level}, "confidence_level is ")
+            for level in (0.5, 1.0, np.nan)
+        ),
         (allan.allan_deviation, GAPPY, {"taus": [6.0]}, "must be between"),
     ],
 )

@@ -69,7 +69,7 @@ class AllanDeviation(Listed):
         Equivalent degrees of freedom of the squared deviation.
     noise_type : ndarray of str (axes, t)
         A value of :data:`NOISE_TYPES`, found from the lag-1 autocorrelation at each τ.
-    level : float
+    confidence_level : float
         Confidence of the band, pointwise.
     samples : int
         Number of samples of the record.
@@ -83,7 +83,7 @@ class AllanDeviation(Listed):
     upper: Array
     edf: Array
     noise_type: NDArray[np.str_]
-    level: float
+    confidence_level: float
     samples: int
     sample_interval: float
 
@@ -111,7 +111,7 @@ def allan_deviation(
     sensor: str = "gyro",
     kind: str = "rate",
     taus: ArrayLike | None = None,
-    level: float = 0.95,
+    confidence_level: float = 0.95,
 ) -> AllanDeviation:
     """Return the Allan deviation of a sensor at rest, with its confidence band.
 
@@ -128,7 +128,7 @@ def allan_deviation(
     taus : array_like, optional
         Averaging times, s, each rounded to a multiple of the sample interval; duplicates are dropped. Default: 12 per decade, up to a
         third of the record, with gaps to a tenth.
-    level : float, default 0.95
+    confidence_level : float, default 0.95
         Confidence of the band, 0.5 to 1.
 
     Returns
@@ -160,7 +160,7 @@ def allan_deviation(
     0.1
     """
     record, dt, scale = averaged(source, sample_interval, sensor, kind)
-    level = confidence(level)
+    confidence_level = confidence(confidence_level)
     known = ~np.isnan(record).any(axis=1)
     samples = int(known.sum())
     if samples < 3:
@@ -175,11 +175,11 @@ def allan_deviation(
     return AllanDeviation(
         taus=np.asarray(multiples * dt),
         deviation=deviation,
-        lower=deviation * np.sqrt(edf / chi2.ppf(0.5 + 0.5 * level, edf)),
-        upper=deviation * np.sqrt(edf / chi2.ppf(0.5 - 0.5 * level, edf)),
+        lower=deviation * np.sqrt(edf / chi2.ppf(0.5 + 0.5 * confidence_level, edf)),
+        upper=deviation * np.sqrt(edf / chi2.ppf(0.5 - 0.5 * confidence_level, edf)),
         edf=edf,
         noise_type=np.vectorize(NOISE_TYPES.__getitem__)(alphas),
-        level=level,
+        confidence_level=confidence_level,
         samples=samples,
         sample_interval=dt,
     )
@@ -280,11 +280,11 @@ def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_int
     return {term: np.sqrt(value) for term, value in {**variance, "total": total}.items()}
 
 
-def confidence(level: float) -> float:
+def confidence(confidence_level: float) -> float:
     """Return a confidence level, checked."""
-    number = checks.positive("level", level)
+    number = checks.positive("confidence_level", confidence_level)
     if not 0.5 < number < 1.0:
-        raise InputError(f"level is {number:g}; a confidence must be between 0.5 and 1, for example 0.95")
+        raise InputError(f"confidence_level is {number:g}; a confidence must be between 0.5 and 1, for example 0.95")
     return number
 
 

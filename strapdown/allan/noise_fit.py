@@ -112,8 +112,8 @@ class NoiseFit(Listed):
     estimate : ndarray (axes, terms)
         Coefficients, averaged over the combinations of terms; NaN if the record does not support the term.
     lower, upper : ndarray (axes, terms)
-        Two-sided interval of confidence ``level``. If the term is not supported, ``lower`` is 0 and ``upper`` the upper end of that
-        interval (for the ramp: a bound on its magnitude), so that the coverage is at least ``level`` whether or not the term is supported;
+        Two-sided interval. If the term is not supported, ``lower`` is 0 and ``upper`` the upper end of that
+        interval (for the ramp: a bound on its magnitude), so that the coverage is at least the level whether or not the term is supported;
         a one-sided bound would have a lower coverage, since the threshold of support selects the low estimates.
     supported : ndarray of bool (axes, terms)
         Whether the record supports the term.
@@ -125,7 +125,7 @@ class NoiseFit(Listed):
         filter, outliers, a Gauss–Markov bias), and the intervals are not valid.
     misfit : tuple of str
         Description of the deviation found by that test, for each axis.
-    level : float
+    confidence_level : float
         Confidence of the intervals.
     samples : int
         Number of samples of the record.
@@ -143,7 +143,7 @@ class NoiseFit(Listed):
     covariance: Array
     misfit_probability: Array
     misfit: tuple[str, ...]
-    level: float
+    confidence_level: float
     samples: int
     sample_interval: float
     sensor: str = "gyro"
@@ -187,7 +187,8 @@ class NoiseFit(Listed):
             Column("to", "upper"),
             Column(None, "supported"),
         )
-        title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
+        samples, percent = f"{self.samples} samples of {self.sample_interval:.6g} s", 100.0 * self.confidence_level
+        title = f"Noise of the {self.sensor}, {samples}, {percent:g} % intervals"
         return Table(title, columns, rows, self.warnings, left=3, name=f"{self.sensor}-noise")
 
     def summary(self) -> dict[str, Any]:
@@ -196,9 +197,9 @@ class NoiseFit(Listed):
         Returns
         -------
         dict
-            ``coefficients`` in the units of :data:`UNITS`, ``sample_interval_s``, ``level``, ``misfit_probability``, ``misfit``.
+            ``coefficients`` in the units of :data:`UNITS`, ``sample_interval_s``, ``confidence_level``, ``misfit_probability``, ``misfit``.
         """
-        own = {name: getattr(self, name) for name in ("level", "misfit_probability", "misfit")}
+        own = {name: getattr(self, name) for name in ("confidence_level", "misfit_probability", "misfit")}
         return plain({"sample_interval_s": self.sample_interval, "coefficients": table(self), **own})  # type: ignore[no-any-return]
 
 
@@ -210,7 +211,7 @@ def fit_noise(
     kind: str = "rate",
     terms: Sequence[str] = TERMS,
     highest_frequency: float | None = None,
-    level: float = 0.95,
+    confidence_level: float = 0.95,
 ) -> NoiseFit:
     """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with confidence intervals.
 
@@ -232,7 +233,7 @@ def fit_noise(
     highest_frequency : float, optional
         Maximum frequency of the spectrum that is used, Hz, to exclude a low-pass filter or a vibration. Below it the samples are treated as
         averages.
-    level : float, default 0.95
+    confidence_level : float, default 0.95
         Confidence of the intervals, 0.5 to 1.
 
     Returns
@@ -269,7 +270,7 @@ def fit_noise(
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
     record, dt, scale = averaged(source, sample_interval, sensor, kind)
-    level = confidence(level)
+    confidence_level = confidence(confidence_level)
     checks.one_of("sensor", sensor, UNITS)
     names = [checks.one_of("terms: term", term, TERMS) for term in terms]
     in_order = tuple(term for term in TERMS if term in names)
@@ -289,7 +290,7 @@ def fit_noise(
         fits.append(fit_axis(whole, "rate_ramp" in in_order))
         misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
     samples = sum(segment.place.stop - segment.place.start for segment in segments)
-    fit = _of_axes(in_order, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    fit = _of_axes(in_order, fits, misfits, confidence_level=confidence_level, samples=samples, sample_interval=dt)
     return replace(fit, sensor=sensor)
 
 
@@ -466,13 +467,13 @@ def _weights(fits: Sequence[AxisFit], i: int) -> dict[tuple[bool, ...], float]:
 
 
 def _interval(
-    fit: AxisFit, i: int, weights: Mapping[tuple[bool, ...], float], level: float
+    fit: AxisFit, i: int, weights: Mapping[tuple[bool, ...], float], confidence_level: float
 ) -> tuple[float, float, float]:
     """Return estimate, lower and upper end of a coefficient on one axis; if not supported NaN, 0 and the upper end."""
     from scipy.optimize import brentq
     from scipy.special import ndtr, ndtri
 
-    tail = 0.5 - 0.5 * level
+    tail = 0.5 - 0.5 * confidence_level
     heavy = {subset: weight for subset, weight in weights.items() if weight > min(0.05 * tail, SUPPORT_PROBABILITY)}
     total = sum(heavy.values())
 
@@ -527,7 +528,7 @@ def _of_axes(
     fits: Sequence[AxisFit],
     misfits: Sequence[tuple[float, str]],
     *,
-    level: float,
+    confidence_level: float,
     samples: int,
     sample_interval: float,
 ) -> NoiseFit:
@@ -538,11 +539,11 @@ def _of_axes(
     for i in range(count):
         weights = _weights(fits, i)
         for axis, fit in enumerate(fits):
-            estimate[axis, i], lower[axis, i], upper[axis, i] = _interval(fit, i, weights, level)
+            estimate[axis, i], lower[axis, i], upper[axis, i] = _interval(fit, i, weights, confidence_level)
     for axis, fit in enumerate(fits):
         covariance[axis, :count, :count] = _covariance(fit, estimate[axis, :count])
         if len(terms) > count:
-            estimate[axis, -1], lower[axis, -1], upper[axis, -1] = _fit_ramp(fit, level)
+            estimate[axis, -1], lower[axis, -1], upper[axis, -1] = _fit_ramp(fit, confidence_level)
             if not math.isnan(estimate[axis, -1]):
                 covariance[axis, -1, :-1] = covariance[axis, :-1, -1] = np.where(
                     np.isnan(estimate[axis, :-1]), np.nan, 0.0
@@ -557,20 +558,20 @@ def _of_axes(
         covariance=covariance,
         misfit_probability=np.array([probability for probability, _ in misfits]),
         misfit=tuple(what for _, what in misfits),
-        level=level,
+        confidence_level=confidence_level,
         samples=samples,
         sample_interval=sample_interval,
     )
 
 
-def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
+def _fit_ramp(fit: AxisFit, confidence_level: float) -> tuple[float, float, float]:
     """Return estimate, lower and upper end of the ramp; if not supported NaN, 0 and a bound on its magnitude."""
     from scipy.optimize import brentq
     from scipy.stats import chi2
 
     bins, free = fit.bins, np.ones(len(fit.best.theta), dtype=bool)
     top = _maximise(bins, fit.best.theta, free, restricted=False)
-    drop = 0.5 * float(chi2.ppf(level, 1))
+    drop = 0.5 * float(chi2.ppf(confidence_level, 1))
 
     def fall(slope: float) -> float:
         return _maximise(bins, top.theta, free, slope=slope).loss - top.loss

@@ -108,7 +108,7 @@ def to_specification(fit: NoiseFit, source: str) -> str:
     if partly or wholly:
         text += "\n" + commented(
             [
-                f"Not detected in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
+                f"Not detected in the record, so left out; the upper ends of their {100 * fit.confidence_level:g} % intervals:",
                 *partly,
                 *wholly,
             ]
@@ -150,8 +150,8 @@ def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
     from scipy.special import ndtri
 
     i = fit.terms.index(term)
-    tail = 1.0 - fit.level
-    below = min(1.0 - fit.level ** (1.0 / len(fit.estimate)), 0.5 * tail)
+    tail = 1.0 - fit.confidence_level
+    below = min(1.0 - fit.confidence_level ** (1.0 / len(fit.estimate)), 0.5 * tail)
     usual, supported = ndtri(0.5 * tail), fit.supported[:, i]
     centre = np.where(supported, fit.estimate[:, i], 1.0)
 
@@ -199,7 +199,7 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
         ):
             value, supported = largest(fits[sensor], term)
             low, high = (factor * end for end in largest_interval(fits[sensor], term))
-            interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
+            interval = f"{100.0 * fits[sensor].confidence_level:g} % interval {low:.6e} to {high:.6e}"
             note = "" if supported else "; not detected, the upper end of its interval"
             lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]

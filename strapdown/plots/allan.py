@@ -28,7 +28,7 @@ def allan_axis(
         color=style.SKY,
         alpha=0.5,
         linewidth=0,
-        label=f"{100 * deviation.level:.0f} % confidence",
+        label=f"{100 * deviation.confidence_level:.0f} % confidence",
     )
     ax.loglog(
         deviation.taus, deviation.deviation[axis] / scale, "o", color=style.BLUE, markersize=2.5, label="measured"
