@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import pickle
 import re
 from dataclasses import replace
 
@@ -64,6 +65,7 @@ def test_a_right_filter_is_consistent():
     judgement = consistency.judge(*estimate())
     assert judgement.verdict == "consistent"
     assert judgement.required == 1.5
+    assert pickle.loads(pickle.dumps(judgement)) == judgement  # also where a statistic has no bounds, NaN
     assert "a consistent filter fails with at most 1 %" in judgement.listing().notes[0]
     assert not any(finding.rejected for finding in judgement.findings)
     assert {finding.name for finding in judgement.findings} == {

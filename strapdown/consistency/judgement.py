@@ -28,7 +28,7 @@ from strapdown.consistency.whiteness import (
 from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
-from strapdown.results import Column, Listed, Table, figure
+from strapdown.results import ByValue, Column, Listed, Table, figure
 
 Answer = Literal["consistent", "cannot tell", "not consistent"]
 VERDICTS: tuple[Answer, ...] = get_args(Answer)
@@ -65,8 +65,8 @@ _LEANINGS = {
 """Reason by whether the ratios that contradict the filter are greater than 1."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Finding(ByValue):
     """One statistic with its bounds for a consistent filter.
 
     Parameters
@@ -154,8 +154,8 @@ class Part:
     """Reason why it is not tested; empty if it is."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Judgement(Listed):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judgement(ByValue, Listed):
     """A verdict with its evidence.
 
     Parameters
