@@ -488,15 +488,30 @@ def test_a_moving_hand_and_a_gap_are_no_rest():
     np.testing.assert_array_equal(rests_of(gap).last, [199, 599])
 
 
+def lying(seconds: int, rate: np.ndarray, swell: float = 0.0) -> Recording:
+    """A unit without a magnetometer that lies still: ``rate`` (n,) about the vertical, rad/s; vertical acceleration of 0.1 Hz, m/s²."""
+    time = 0.1 * np.arange(1, 10 * seconds + 1)
+    up = np.array([[0.0, 0.0, 1.0]])
+    force = (9.80665 + swell * np.sin(0.2 * np.pi * time))[:, None] * up
+    return Recording(source="lying", time=time, rate=rate[:, None] * up, specific_force=force)
+
+
 def test_a_long_rest_is_measured_until_it_says_no_more_than_is_known():
     """In closed form: of σ equal to that of the prior the first is used; then it takes r/q seconds until the bias has drifted as far."""
-    n = 1000
-    time = np.arange(n, dtype=float)
-    rests = starting.Rests(np.arange(1, n), np.zeros((n - 1, 3)), np.full(n - 1, 1e-3))
-    parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1e-3 + 1e-9, rate_random_walk=1e-4)
-    kept = starting.informative(rests, time, parameters).last
-    assert kept[0] == 1
-    assert kept[1] - 1 == pytest.approx(50, abs=1)  # ½σ² + q t = σ²
+    parameters = dataclasses.replace(
+        ahrs.HAND_HELD, bias_sigma=4e-3 + 1e-9, rest_bias_sigma=4e-3, rate_random_walk=4e-4
+    )
+    rests = starting.rests(lying(100, np.zeros(1000)), parameters)
+    used = np.flatnonzero(np.isfinite(rests.gained))
+    assert used[0] == 0
+    assert used[1] == pytest.approx(50, abs=1)  # ½σ² + q t = σ²
+    np.testing.assert_array_equal(rests.gained[used], 0.0)
+
+
+def test_at_rest_the_heading_without_a_magnetometer_does_not_drift_with_the_bias():
+    """It changes by 0.1 °/s in 5 minutes, which makes 15°; the model's random walk is 0.01 °/s in that time."""
+    estimate = ahrs.estimate(lying(300, np.linspace(0.0, 0.1 * DEGREE, 3000))).estimate
+    assert np.ptp(estimate.rotation.as_euler("ZYX", degrees=True)[:, 0]) < 1.0
 
 
 def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():
@@ -526,7 +541,7 @@ def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():
 def test_all_rests_are_combined_as_they_drift():
     """Two rests of one σ: the bias at the first sample by least squares over the values of a random walk."""
     time = np.array([0.0, 10.0, 40.0])
-    rests = starting.Rests(np.array([1, 2]), np.array([[1e-3] * 3, [4e-3] * 3]), np.array([1e-3, 2e-3]))
+    rests = starting.Rests(np.array([1, 2]), np.array([[1e-3] * 3, [4e-3] * 3]), np.array([1e-3, 2e-3]), np.zeros(2))
     parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1.0, rate_random_walk=2e-4)
     plain = recording()
     state = starting.with_all_rests(begun(plain, parameters), rests, time, parameters)

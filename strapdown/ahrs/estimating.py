@@ -18,7 +18,6 @@ from strapdown.ahrs.starting import (
     Rests,
     first_vector,
     for_whole,
-    informative,
     need_accelerometer,
     rests,
     samples_in_span,
@@ -161,7 +160,7 @@ def estimate(
     if smooth:
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     else:
-        at_rest = informative(at_rest, used.time, parameters)
+        at_rest = Rests(*(column[np.isfinite(at_rest.gained)] for column in at_rest))
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, at_rest, options)
     at_stamps = _at_stamps(filtered, used, prepared, parameters, delays, options)
@@ -211,7 +210,7 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
 
     def change(edge: int, x: Array, P: Array) -> None:
         for k in np.flatnonzero(rested == edge):
-            take_rate_at_rest(x, P, at_rest.rate[k], float(at_rest.sigma[k]))
+            take_rate_at_rest(x, P, at_rest.rate[k], float(at_rest.sigma[k]), float(at_rest.gained[k]))
         P[[0, 1, 2], [0, 1, 2]] += added[edge]
 
     bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()

@@ -186,7 +186,7 @@ class LiveAhrs:
         of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
         heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
         samples = imu.time, imu.gyro, imu.accelerometer, imu.magnetic if self.magnetometer else imu.magnetic[:0]
-        at_rest = starting.kernel.Means(a.found_rate, a.found_rest)
+        at_rest = starting.kernel.Means(a.found_rate, a.found_rest, a.found_gained)
         return kernel.Routines(
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
@@ -262,8 +262,9 @@ class LiveAhrs:
         if code < 0:
             self._refuse(code)
         if code == kernel.RESTED:
-            rate, sigma = self._rests.rest_rate[0], math.sqrt(self._rests.rest_variance[0])
-            change(self._filter, functools.partial(starting.take_rate_at_rest, rate=rate, sigma=sigma))
+            rate, (variance, _, gained) = self._rests.rest_rate[0], self._rests.rest_variance.tolist()
+            measured = {"rate": rate, "sigma": math.sqrt(variance), "gained": gained}
+            change(self._filter, functools.partial(starting.take_rate_at_rest, **measured))
             self._imu.resting[1] = 0
 
     def _begin(self) -> None:

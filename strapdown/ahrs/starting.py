@@ -32,6 +32,9 @@ SWING_TIME = 0.1
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
+BIAS_DRIFT = 3e-4
+"""Least random walk of the gyro's bias between rests, rad/s/√s: that of the model with a magnetometer. Without one the filter's is smaller,
+so that acceleration is not taken for bias."""
 VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
@@ -159,9 +162,12 @@ class Rests(NamedTuple):
     """Mean rate (m, 3), rad/s."""
     sigma: Array
     """σ of each axis (m,), rad/s."""
+    gained: Array
+    """Variance that the bias has gained since the rest before and the filter does not model (m,), (rad/s)²; infinite if a rest shows no
+    more than is known: a long one is measured once, and again as the bias drifts."""
 
 
-NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0))
+NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0))
 
 
 def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
@@ -169,15 +175,16 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     if parameters.rest_bias_sigma == 0.0:
         return NO_REST
     constants, memory = constants_of(recording.interval, parameters), memory_of(recording.interval, parameters)
+    memory.rest_clock[1] = recording.time[0]
     length = constants.parts * constants.part
     n = len(recording.time) // length
-    means = kernel.Means(np.empty((n, 3)), np.empty(n))
+    means = kernel.Means(np.empty((n, 3)), np.empty(n), np.empty(n))
     field = np.empty((0, 3)) if recording.magnetic_field is None else recording.magnetic_field
     assert recording.specific_force is not None
     samples = recording.time, recording.rate, recording.specific_force, field
     compiled(kernel.find_rests)(constants, *map(read_only, samples), memory, means)
     (quiet,) = np.nonzero(np.isfinite(means.variance))
-    return Rests(length * (quiet + 1) - 1, means.rate[quiet], np.sqrt(means.variance[quiet]))
+    return Rests(length * (quiet + 1) - 1, means.rate[quiet], np.sqrt(means.variance[quiet]), means.gained[quiet])
 
 
 def rest_length(interval: float) -> tuple[int, int]:
@@ -190,6 +197,8 @@ def rest_length(interval: float) -> tuple[int, int]:
 def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constants:
     """Return the kernel's constants at this interval of the samples, s."""
     parts, part = rest_length(interval)
+    modelled = parameters.rate_random_walk**2
+    walk = max(modelled, BIAS_DRIFT**2)
     return kernel.Constants(
         parts=parts,
         part=part,
@@ -197,7 +206,8 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
         own_variance=parameters.rest_bias_sigma**2,
         max_variance=MAX_REST_SIGMA**2,
         turning=TURNING_RATE**2,
-        walk=parameters.rate_random_walk**2,
+        walk=walk,
+        unmodelled=walk - modelled,
     )
 
 
@@ -209,28 +219,20 @@ def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
         halves_number=np.zeros(4, np.int64),
         resting=np.zeros(2, np.int64),
         rest_rate=np.zeros((1, 3)),
-        rest_variance=np.array([np.inf, parameters.bias_sigma**2]),
+        rest_variance=np.array([np.inf, parameters.bias_sigma**2, np.inf]),
         rest_clock=np.zeros(2),
     )
 
 
-def informative(at_rest: Rests, time: Array, parameters: AhrsParameters) -> Rests:
-    """Return those spans whose σ is below that of the bias by the spans before: a long rest is measured once, and again as it drifts."""
-    variance, before, kept = parameters.bias_sigma**2, time[0], []
-    for k, (last, sigma) in enumerate(zip(at_rest.last, at_rest.sigma, strict=True)):
-        drifted = variance + parameters.rate_random_walk**2 * (time[last] - before)
-        if sigma**2 < drifted:
-            variance, before = kernel.combined(drifted, sigma**2), time[last]
-            kept.append(k)
-    return Rests(at_rest.last[kept], at_rest.rate[kept], at_rest.sigma[kept])
-
-
-def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float) -> None:
+def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float, gained: float = 0.0) -> None:
     """Correct attitude, bias and error states x (n + 1,) and their covariance by a measurement of the gyro's bias (3,) with σ, rad/s.
+
+    ``gained``: variance that the bias has gained and P has not, (rad/s)².
 
     The velocity, which is defined in the axes of the estimated attitude, is not rotated with it: at rest it is as small as the correction,
     so the difference is of second order (at most 0.01° over 88 public recordings).
     """
+    P[[3, 4, 5], [3, 4, 5]] += gained
     K = np.linalg.solve(P[3:6, 3:6] + sigma**2 * np.eye(3), P[3:6]).T
     change = K @ (rate - x[4:7])
     left = np.eye(len(P))

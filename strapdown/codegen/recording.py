@@ -298,6 +298,8 @@ def use_rest(f: Any) -> None:
     """Correct the state by a rate at rest."""
     k, n, work = f.kernels, f.program.n, f.work
     k.clear_step(work, 0.0)
+    for i in range(3, 6):
+        f.P[body.place(n, i, i)] += f.rest_variance[2]
     for i in range(3):
         for j in range(n):
             work[k.LINE * k.ROWS + j] = 1.0 if j == 3 + i else 0.0

@@ -76,6 +76,7 @@ PASSING = {
     "found_variance": ((1,), "", "variance of the heading by constant iron"),
     "found_rate": ((1, 3), "", "mean rate at rest"),
     "found_rest": ((1,), "", "its variance"),
+    "found_gained": ((1,), "", "variance that the bias has gained"),
 }
 """Arrays that are written anew for each sample or step."""
 Arrays: Any = NamedTuple("Arrays", [(name, np.ndarray) for name in (*LASTING, *PASSING)])  # type: ignore[misc]

@@ -31,7 +31,9 @@ class Constants(NamedTuple):
     turning: float
     """Squared mean rate, (rad/s)², above which vertical and field are examined for a rotation with it."""
     walk: float
-    """Variance that the bias gains in a second."""
+    """Variance that the bias gains in a second between rests."""
+    unmodelled: float
+    """The part of it that the filter does not model."""
 
 
 class Memory(NamedTuple):
@@ -48,7 +50,7 @@ class Memory(NamedTuple):
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
-    """Its variance, infinite if it was no rest, and that of the bias by all rests (2,)."""
+    """Its variance, infinite if it was no rest, that of the bias by all rests, and the part of its gain that is not modelled (3,)."""
     rest_clock: np.ndarray
     """Time of the first sample of the span, and of the last rest, s (2,)."""
 
@@ -60,6 +62,8 @@ class Means(NamedTuple):
     """Mean rate (k, 3), rad/s."""
     variance: np.ndarray
     """Its variance (k,); infinite if it was no rest."""
+    gained: np.ndarray
+    """Variance that the bias has gained since the rest before and the filter does not model (k,); infinite if it shows no more."""
 
 
 def find_rests(constants, time, rate, force, field, memory, means):
@@ -80,6 +84,7 @@ def find_rests(constants, time, rate, force, field, memory, means):
             clear_span(memory)
             store_row(means.rate, i // length, vector_at(memory.rest_rate, 0))
             means.variance[i // length] = memory.rest_variance[0]
+            means.gained[i // length] = memory.rest_variance[2]
 
 
 def add(sums, row, vector):
@@ -132,16 +137,14 @@ def find_rest(constants, time, memory):
     )
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
-    drifted = memory.rest_variance[1] + constants.walk * (time - memory.rest_clock[1])
+    since = time - memory.rest_clock[1]
+    drifted = memory.rest_variance[1] + constants.walk * since
+    memory.rest_variance[2] = math.inf
     if still and variance < drifted:
         memory.resting[1] = 1
+        memory.rest_variance[2] = constants.unmodelled * since
         memory.rest_clock[1] = time
-        memory.rest_variance[1] = combined(drifted, variance)
-
-
-def combined(variance, other):
-    """Return the variance of the mean of two measurements, weighted by their information."""
-    return 1.0 / (1.0 / variance + 1.0 / other)
+        memory.rest_variance[1] = 1.0 / (1.0 / drifted + 1.0 / variance)
 
 
 def turned_with(constants, rate, memory, first):
