@@ -575,6 +575,12 @@ def test_the_bias_of_the_accelerometer_has_the_sigma_that_rest_shows(bias):
     assert parameters.accelerometer_bias_sigma == pytest.approx(expected, abs=2e-3)
 
 
+def test_a_swell_is_no_bias_of_the_accelerometer():
+    at_sea = lying(60, np.zeros(600), swell=0.4)
+    parameters = starting.for_whole(at_sea, ahrs.HAND_HELD_SMOOTHED, rests_of(at_sea))
+    assert parameters.accelerometer_bias_sigma == ahrs.HAND_HELD_SMOOTHED.accelerometer_bias_sigma
+
+
 @pytest.mark.parametrize(("variation", "factor"), [(0.1, 0.4), (0.7, 0.5), (1.4, 1.0), (2.1, 1.5), (9.0, 2.0)])
 def test_the_smoothers_acceleration_follows_that_of_the_recording(variation, factor):
     """The magnitude alternates between two values, whose deviation is known."""

@@ -39,6 +39,8 @@ VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
 """Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
+SLOWEST_SWELL = 0.1
+"""Frequency of the slowest acceleration that is distinguished from such a bias, Hz."""
 MIN_LEVEL = 0.07
 """Squared cosine of the dip, 75°, beyond which a field has hardly a heading."""
 FIRST_HEADING = 0.1
@@ -251,7 +253,7 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
     """Return the smoother's parameters, which follow what a whole recording shows of the motion and of the accelerometer.
 
     σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``). If the specific
-    force at rest differs from gravity by more than :data:`MAX_DEVIATION`, σ of the accelerometer's bias is that difference.
+    force at rest differs from gravity by more than :data:`MAX_DEVIATION`, and constantly, σ of the accelerometer's bias is that difference.
     """
     assert recording.specific_force is not None
     if parameters.usual_variation > 0.0:
@@ -262,10 +264,13 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
     if parameters.accelerometer_bias_sigma > 0.0 and len(at_rest.last):
         parts, part = rest_length(recording.interval)
         spans = recording.specific_force[np.add.outer(at_rest.last, np.arange(1 - parts * part, 1))]
-        force = lengths(np.nanmean(spans, axis=1))
-        deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
-        if deviation > MAX_DEVIATION:
-            parameters = replace(parameters, accelerometer_bias_sigma=deviation)
+        halves = [np.nanmean(half, axis=1) for half in np.array_split(spans, 2, axis=1)]
+        first, second = (lengths(half) - STANDARD_GRAVITY for half in halves)
+        # An acceleration of frequency f changes by π f of its amplitude from half to half of a second; a bias does not.
+        by_motion = (second - first) ** 2 / (np.pi * SLOWEST_SWELL) ** 2
+        square = float(np.mean(0.25 * (first + second) ** 2 - by_motion))
+        if square > MAX_DEVIATION**2:
+            parameters = replace(parameters, accelerometer_bias_sigma=square**0.5)
     return parameters
 
 
