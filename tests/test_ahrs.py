@@ -450,6 +450,14 @@ def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0)
     )
 
 
+def lying(seconds: int, rate: np.ndarray, swell: float = 0.0) -> Recording:
+    """A unit without a magnetometer that lies still: ``rate`` (n,) about the vertical, rad/s; vertical acceleration of 0.1 Hz, m/s²."""
+    time = 0.1 * np.arange(1, 10 * seconds + 1)
+    up = np.array([[0.0, 0.0, 1.0]])
+    force = (9.80665 + swell * np.sin(0.2 * np.pi * time))[:, None] * up
+    return Recording(source="lying", time=time, rate=rate[:, None] * up, specific_force=force)
+
+
 def rests_of(recording: Recording) -> starting.Rests:
     """Spans at rest, as the filter finds them."""
     return starting.rests(recording, ahrs.HAND_HELD)
@@ -480,20 +488,24 @@ def test_a_steady_turn_is_no_rest(turn, field):
     assert len(rests_of(quiet_second(turn, turn=turn, field=field)).last) == 0
 
 
+@pytest.mark.parametrize("turn", [1.0, 60.0])
+def test_a_steady_turn_about_the_vertical_is_no_rest_after_one(turn):
+    """Without a magnetometer nothing but the bias by the rest before distinguishes it; the rest after it is one again."""
+    rate = turn * DEGREE * (np.arange(600) // 200 == 1)
+    last = rests_of(lying(60, rate)).last
+    np.testing.assert_array_equal(last, [k for k in range(9, 600, 10) if k // 200 != 1])
+
+
+def test_after_a_first_rest_in_a_steady_turn_the_true_ones_are_used():
+    assert rests_of(lying(40, 5.0 * DEGREE * (np.arange(400) < 200))).last[-1] == 399
+
+
 def test_a_moving_hand_and_a_gap_are_no_rest():
     plain = quiet_second((0.0, 0.0, 0.0))
     swing = 20.0 * DEGREE * np.sin(2.0 * np.pi * 0.7 * plain.time)[:, None] * np.array([1.0, 0.0, 0.5])
     assert len(rests_of(dataclasses.replace(plain, rate=plain.rate + swing)).last) == 0
     gap = dataclasses.replace(plain, time=plain.time + np.where(plain.time > 1.5, 1.0, 0.0))
     np.testing.assert_array_equal(rests_of(gap).last, [199, 599])
-
-
-def lying(seconds: int, rate: np.ndarray, swell: float = 0.0) -> Recording:
-    """A unit without a magnetometer that lies still: ``rate`` (n,) about the vertical, rad/s; vertical acceleration of 0.1 Hz, m/s²."""
-    time = 0.1 * np.arange(1, 10 * seconds + 1)
-    up = np.array([[0.0, 0.0, 1.0]])
-    force = (9.80665 + swell * np.sin(0.2 * np.pi * time))[:, None] * up
-    return Recording(source="lying", time=time, rate=rate[:, None] * up, specific_force=force)
 
 
 def test_a_long_rest_is_measured_until_it_says_no_more_than_is_known():

@@ -262,7 +262,7 @@ class LiveAhrs:
         if code < 0:
             self._refuse(code)
         if code == kernel.RESTED:
-            rate, (variance, _, gained) = self._rests.rest_rate[0], self._rests.rest_variance.tolist()
+            rate, (variance, _, _, gained) = self._rests.rest_rate[0], self._rests.rest_variance.tolist()
             measured = {"rate": rate, "sigma": math.sqrt(variance), "gained": gained}
             change(self._filter, functools.partial(starting.take_rate_at_rest, **measured))
             self._imu.resting[1] = 0

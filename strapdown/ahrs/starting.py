@@ -28,6 +28,10 @@ MAX_REST_SIGMA = 1.0 * DEGREE
 """Maximum σ, rad/s, of the mean rate of a span as a measurement of the bias."""
 TURNING_RATE = 0.3 * DEGREE
 """Mean rate, rad/s, above which vertical and field are examined for a rotation with it."""
+TURN_ODDS = 5.0
+"""Difference of a mean rate from the bias by the rests before, relative to its σ, above which it is a turn."""
+FIRST_BIAS_SIGMA = 2.0 * DEGREE
+"""Its σ before the first rest, rad/s, without a magnetometer too."""
 SWING_TIME = 0.1
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
@@ -208,6 +212,7 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
         own_variance=parameters.rest_bias_sigma**2,
         max_variance=MAX_REST_SIGMA**2,
         turning=TURNING_RATE**2,
+        odds=TURN_ODDS**2,
         walk=walk,
         unmodelled=walk - modelled,
     )
@@ -221,7 +226,8 @@ def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
         halves_number=np.zeros(4, np.int64),
         resting=np.zeros(2, np.int64),
         rest_rate=np.zeros((1, 3)),
-        rest_variance=np.array([np.inf, parameters.bias_sigma**2, np.inf]),
+        rest_variance=np.array([np.inf, parameters.bias_sigma**2, FIRST_BIAS_SIGMA**2, np.inf]),
+        rest_bias=np.zeros((1, 3)),
         rest_clock=np.zeros(2),
     )
 

@@ -28,6 +28,8 @@ class Constants(NamedTuple):
     """Variance of the mean rate of a unit that does not move, (rad/s)²."""
     max_variance: float
     """Variance of the mean rate from which on the unit moves, (rad/s)²."""
+    odds: float
+    """Squared difference of a mean rate from the bias by the rests before, relative to its variance, above which it is a turn."""
     turning: float
     """Squared mean rate, (rad/s)², above which vertical and field are examined for a rotation with it."""
     walk: float
@@ -50,7 +52,9 @@ class Memory(NamedTuple):
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
-    """Its variance, infinite if it was no rest, that of the bias by all rests, and the part of its gain that is not modelled (3,)."""
+    """Its variance, infinite if it was no rest; that of the bias by all rests, drifting or not; the drift that is not modelled (4,)."""
+    rest_bias: np.ndarray
+    """Bias by all rests (1, 3), rad/s."""
     rest_clock: np.ndarray
     """Time of the first sample of the span, and of the last rest, s (2,)."""
 
@@ -84,7 +88,7 @@ def find_rests(constants, time, rate, force, field, memory, means):
             clear_span(memory)
             store_row(means.rate, i // length, vector_at(memory.rest_rate, 0))
             means.variance[i // length] = memory.rest_variance[0]
-            means.gained[i // length] = memory.rest_variance[2]
+            means.gained[i // length] = memory.rest_variance[3]
 
 
 def add(sums, row, vector):
@@ -115,7 +119,8 @@ def find_rest(constants, time, memory):
     """Decide at the end of a span whether it was a rest.
 
     The variance of its mean rate is that of a unit at rest and the spread of the rate between the parts, which is motion of the hand. A
-    span with a gap is no rest, nor one with which the vertical or the field rotates: a steady turn is no bias.
+    span with a gap is no rest, nor one with which the vertical or the field rotates, nor one that is faster than a bias that the rests
+    before leave possible: a steady turn is no bias.
     """
     parts, part = constants.parts, constants.part
     rate = (0.0, 0.0, 0.0)
@@ -127,24 +132,29 @@ def find_rest(constants, time, memory):
         off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
         spread += dot(off, off)
     variance = constants.own_variance + spread / parts
+    bias = vector_at(memory.rest_bias, 0)
+    change = combine(1.0, rate, -1.0, bias)
+    changed = dot(change, change) > constants.odds * (variance + memory.rest_variance[2])
     with_force, square_force = turned_with(constants, rate, memory, 0)
     with_field, square_field = turned_with(constants, rate, memory, 2)
     still = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
         and memory.halves_number[0] + memory.halves_number[1] > parts * part // 2
+        and not (changed and 4.0 * dot(rate, rate) > dot(bias, bias))
         and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
     )
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
     since = time - memory.rest_clock[1]
     drifted = memory.rest_variance[1] + constants.walk * since
-    memory.rest_variance[2] = math.inf
+    memory.rest_variance[3] = math.inf
     if still and variance < drifted:
         memory.resting[1] = 1
-        memory.rest_variance[2] = constants.unmodelled * since
+        memory.rest_variance[3] = constants.unmodelled * since
         memory.rest_clock[1] = time
-        memory.rest_variance[1] = 1.0 / (1.0 / drifted + 1.0 / variance)
+        memory.rest_variance[1] = memory.rest_variance[2] = 1.0 / (1.0 / drifted + 1.0 / variance)
+        store_row(memory.rest_bias, 0, combine(1.0, bias, drifted / (drifted + variance), change))
 
 
 def turned_with(constants, rate, memory, first):
