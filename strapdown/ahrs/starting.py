@@ -38,7 +38,7 @@ MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
 BIAS_DRIFT = 3e-4
 """Least random walk of the gyro's bias between rests, rad/s/√s: that of the model with a magnetometer. Without one the filter's is smaller,
-so that acceleration is not taken for bias."""
+so that acceleration is not treated as bias."""
 VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
