@@ -72,9 +72,10 @@ def _model(moved_by: str, result: AhrsEstimate) -> str:
             f"{beyond if bias > MAX_BIAS * parameters.bias_sigma else ''}"
         )
     at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
-    rows = np.arange(result.rests.last[0], len(time), max(1, round(1.0 / result.recording.interval)))
-    measured = result.rests.rate[np.searchsorted(result.rests.last, rows, side="right") - 1]
-    departure = float(lengths(result.estimate.bias[rows] - measured).max())
+    second = max(1, round(1.0 / result.recording.interval))
+    rows = np.arange(result.rests.last[0] + second, len(time), second)
+    measured = result.rests.rate[np.searchsorted(result.rests.last, rows) - 1]
+    departure = float(lengths(result.estimate.bias[rows] - measured).max(initial=0.0))
     beyond = (
         f" In between it is estimated to differ by up to {departure / DEGREE:.2g} deg/s, as no gyro's does: this motion does not suit, and "
         "errors may exceed their σ."
