@@ -135,13 +135,15 @@ def find_rest(constants, time, memory):
     bias = vector_at(memory.rest_bias, 0)
     change = combine(1.0, rate, -1.0, bias)
     changed = dot(change, change) > constants.odds * (variance + memory.rest_variance[2])
+    # Unless the new rate is less than half of that bias, which then was a turn itself.
+    turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
     with_force, square_force = turned_with(constants, rate, memory, 0)
     with_field, square_field = turned_with(constants, rate, memory, 2)
     still = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
         and memory.halves_number[0] + memory.halves_number[1] > parts * part // 2
-        and not (changed and 4.0 * dot(rate, rate) > dot(bias, bias))
+        and not turns
         and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
     )
     store_row(memory.rest_rate, 0, rate)
