@@ -73,6 +73,7 @@ class Change(NamedTuple):
 
 
 SHORT = {"accelerometer": "acc", "magnetometer": "mag", "gyro": "gyro", "whole unit": "whole unit"}
+"""Names in few words."""
 
 
 def _unit(fault: str, taken: str, sensor: str, unit: str) -> Change:
@@ -482,15 +483,16 @@ _Sensors = Mapping[str, _Sensor]
 
 def _sensor(vectors: Array, step: int) -> _Sensor:
     """Return the samples of a vector in every ``step``-th row, or within a step after it if the sensor is slower than the gyro."""
-    rows = np.arange(0, len(vectors), step)
-    if np.isnan(vectors[rows]).any():
+    samples = vectors[::step]
+    if np.isnan(samples).any():
+        rows = np.arange(0, len(vectors), step)
         known = np.append(np.flatnonzero(np.isfinite(vectors).all(axis=1)), len(vectors) + step)
         later = known[np.searchsorted(known, rows)]
-        rows = np.where(later < rows + step, later, rows)
-    size = lengths(vectors[rows])
+        samples = vectors[np.where(later < rows + step, later, rows)]
+    size = lengths(samples)
     there = np.isfinite(size)
     size = size if there.all() else size[there]
-    return _Sensor(vectors[rows], there, size, median(size))
+    return _Sensor(samples, there, size, median(size))
 
 
 class _Windows(NamedTuple):

@@ -75,16 +75,14 @@ class Observability(Listed):
         n, relative = len(self.states), self.start_sigma / self.prior_sigma
         units, sizes = zip(*map(error_state_unit, self.states, self.units), strict=True)
         rows = list(zip(self.states, units, self.prior_sigma / sizes, relative, self.unobserved, strict=True))
-        columns: list[Column | str] = [
-            "state",
-            "unit",
-            *(Column(label, digits=3) for label in ("prior σ", "start/prior")),
-        ]
+        sigmas = (Column(label, digits=3) for label in ("prior σ", "start/prior"))
         weakest = range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
         notes = [f"{self.singular_values[k]:14.3g}: {self._words(k)}" for k in weakest]
         notes.insert(0, "singular value: the weakest directions, each state relative to its prior σ")
         title = f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)"
-        return Table(title, [*columns, Column("unobserved", shown="{:.2f}".format)], rows, notes, left=2)
+        return Table(
+            title, ["state", "unit", *sigmas, Column("unobserved", shown="{:.2f}".format)], rows, notes, left=2
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units; the directions as rows, each state relative to its prior σ.
