@@ -29,7 +29,8 @@ def turned(iron, duration: float = 60.0, size: float = 1.0, noise: float = 0.2, 
 def iron_of(field, frame, time, causal=True, known=None):
     known = np.ones(len(time), bool) if known is None else known
     if not causal:
-        return hard_iron.find(field, frame, time, known, STRENGTH)
+        up = np.tile([0.0, 0.0, 1.0], (len(time), 1))
+        return hard_iron.find(field, up, frame, known, time, STRENGTH, hard_iron.SIGMA)[0]
     others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
     constants = headings.Constants(**others | hard_iron.parts(STEP))
     memory, result = hard_iron.memory(constants.lag, 1), np.empty((len(time), 3))
@@ -100,3 +101,23 @@ def test_iron_is_forgotten():
     result = iron_of(*turned(iron, duration=300.0))
     assert np.linalg.norm(result[round(60.0 / STEP) - 1]) > 12.0
     assert np.linalg.norm(result[-1]) < 0.01 * STRENGTH
+
+
+@pytest.mark.parametrize("axis", [None, [0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+def test_iron_is_as_uncertain_as_at_first_in_directions_that_no_rotation_shows(axis):
+    """Body axes are East, North, up in the mean: iron to the East turns the heading, and a rotation about it does not show it."""
+    time = STEP * np.arange(1, 2001)
+    R = Rotation.from_rotvec(np.sin(0.9 * time)[:, None] * np.array(axis or [0.0, 0.0, 0.0]))
+    frame, up = np.roll(R.as_quat(), 1, axis=-1), np.tile([0.0, 0.0, 1.0], (len(time), 1))
+    field = np.tile(FIELD, (len(time), 1))
+    known = np.ones(len(time), bool)
+    variance = hard_iron.find(field, up, frame, known, time, STRENGTH, 0.04)[1]
+    # With A = R − R' a second apart and noise density n: (AᵀA summed over n² + I/σ²)⁻¹ along the East in body axes.
+    lag = round(1.0 / STEP)
+    A = R.as_matrix()[lag:] - R.as_matrix()[:-lag]
+    k = 1500
+    weight = np.exp(-np.abs(time[lag:] - time[k]) / hard_iron.MEMORY)
+    N = np.einsum("k,kij,kil->jl", weight, A, A) * STEP / hard_iron.CHANGE_NOISE**2 + np.eye(3) / 0.04**2
+    east = R[k].inv().apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(variance[k], east @ np.linalg.solve(N, east), rtol=0.1)
+    assert (variance[k] > 0.9 * 0.04**2) == (axis in (None, [1.0, 0.0, 0.0]))

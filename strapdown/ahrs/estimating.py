@@ -25,7 +25,7 @@ from strapdown.ahrs.starting import (
     with_all_rests,
 )
 from strapdown.calibration import UnitCalibration, with_gyro_states
-from strapdown.checks import Array
+from strapdown.checks import Array, lengths, median
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
 from strapdown.estimation.states import changed
@@ -151,16 +151,22 @@ def estimate(
         used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
         if parameters.gyro_scale_sigma > 0.0 < calibration.gyro_scale_sigma:
             parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
+        if used.magnetic_field is not None and calibration.sigma.hard_iron.any():
+            size = lengths(used.magnetic_field)
+            sigma = calibration.iron_sigma(used) / median(size[np.isfinite(size)])
+            parameters = replace(parameters, unshown_iron_sigma=min(sigma, parameters.unshown_iron_sigma))
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
     if smooth:
         parameters = for_whole(used, parameters, at_rest)
-    prepared = prepare(used, parameters, delays.field, faults.turn_variance, causal=not smooth, turned=turned)
-    if smooth:
-        prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     else:
         at_rest = Rests(*(column[np.isfinite(at_rest.gained)] for column in at_rest))
+    prepared = prepare(
+        used, parameters, delays.field, faults.turn_variance, causal=not smooth, turned=turned, at_rest=at_rest
+    )
+    if smooth:
+        prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, at_rest, options)
     at_stamps = _at_stamps(filtered, used, prepared, parameters, delays, options)

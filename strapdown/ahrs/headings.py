@@ -47,10 +47,23 @@ class FieldSteps(NamedTuple):
     """Duration that the field's samples of each step cover, s; 0: none (k,)."""
     force: Array
     """Specific force (k, 3); without samples that of the step before."""
-    at_edge: Array
-    """Attitude by the gyro at the steps' edges (k + 1, 4)."""
+    end: Array
+    """Attitude by the gyro at the end of each step (k, 4)."""
     time: Array
-    """Time there, s (k + 1,)."""
+    """Time of the steps' edges, s (k + 1,)."""
+    turn_variance: Array
+    """Variance of the rotation by the gyro over each step in addition to its noise, rad² (k,)."""
+
+    def without_drift(self, bias: Array, interval: float) -> FieldSteps:
+        """Return the samples without the rotation of that frame by the gyro's bias (k, 3), rad/s; ``interval``: that of the steps, s."""
+        drift, out = np.array([1.0, 0.0, 0.0, 0.0]), np.empty_like(self.frame)
+        compiled(kernel.drifts)(interval, read_only(bias), read_only(self.frame), drift, out)
+        return self._replace(
+            field=quaternion.rotate(out, self.field),
+            force=quaternion.rotate(out, self.force),
+            frame=quaternion.multiply(out, self.frame),
+            end=quaternion.multiply(out, self.end),
+        )
 
 
 class Headings(NamedTuple):
@@ -101,6 +114,7 @@ def constants_of(parameters: AhrsParameters, interval: float) -> kernel.Constant
         field_disturbance=parameters.field_disturbance,
         field_deviation=parameters.field_deviation,
         iron_sigma=parameters.iron_sigma,
+        iron_prior=parameters.unshown_iron_sigma**2,
         **hard_iron.parts(interval),
     )
 
@@ -112,7 +126,7 @@ def memory_of(constants: kernel.Constants) -> kernel.Memory:
 
 def first_variance(force: Array, field: Array, parameters: AhrsParameters) -> float:
     """Return the variance of the heading by constant iron, rad², from the first specific force and field (3,)."""
-    return float(iron_variance(parameters.iron_sigma, sine_of_dip(force.tolist(), field.tolist())))
+    return float(iron_variance(parameters.first_iron_sigma, sine_of_dip(force.tolist(), field.tolist())))
 
 
 def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
@@ -123,7 +137,10 @@ def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
     vertical = _vertical(steps.force, interval)
     as_measured = _look(field, vertical, parameters, interval)
     measured = as_measured
-    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(measured.usual[0, 0]))
+    usual = float(measured.usual[0, 0])
+    iron, unshown = hard_iron.find(
+        field, vertical, steps.frame, known, steps.time[1:], usual, parameters.unshown_iron_sigma
+    )
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
         without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval)
@@ -142,7 +159,8 @@ def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
     )
     direction = np.where(known[:, None], field / measured.strength[:, None], 0.0)
     vectors = _gathered(steps, direction, steps.length / noise, parameters.heading_interval)
-    return Headings(vectors, measured.usual, iron, (parameters.iron_sigma / np.cos(measured.usual[:, 1])) ** 2)
+    variance = (parameters.iron_sigma**2 + unshown) / np.cos(measured.usual[:, 1]) ** 2
+    return Headings(vectors, measured.usual, iron, variance)
 
 
 class _Look(NamedTuple):
@@ -171,6 +189,10 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
     time = steps.time
     edge = np.flatnonzero(np.diff(np.floor((time[1:] - time[0]) / heading_interval - 1e-6), append=np.inf))
     begin = np.append(0, edge[:-1] + 1)
+    for k in np.flatnonzero(steps.turn_variance * information):  # directions before it are as uncertain
+        before, variance = slice(begin[np.searchsorted(begin, k, side="right") - 1], k), steps.turn_variance[k]
+        information[before] /= 1.0 + variance * information[before].sum()
+        information[k] /= 1.0 + variance * information[k]
     total = np.add.reduceat(direction * information[:, None], begin, axis=0)
     information = np.add.reduceat(information, begin)
     informed = information > 0.0
@@ -179,7 +201,7 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
         sensor="magnetometer",
         kind="heading",
         time=time[1:][edge][informed],
-        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][informed]), total),
+        vector_b=quaternion.rotate(quaternion.conjugate(steps.end[edge][informed]), total),
         reference_f=NORTH,
         sigma=1.0 / np.sqrt(information[informed]),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,6 +51,9 @@ class AhrsParameters:
     iron_sigma : float, default 0.004
         σ of a constant, unobservable disturbance of the field, relative to its magnitude. It is part of the reported σ and is not
         estimated.
+    unshown_iron_sigma : float, default 0.0
+        σ of the unit's hard iron, each component, relative to the magnitude of the field, in directions that no rotation has shown in the
+        last minute. It is part of the reported σ too.
     step : float, default 0.03
         Interval of the filter's steps, s.
     heading_interval : float, default 0.15
@@ -97,6 +101,7 @@ class AhrsParameters:
     hard_iron_sigma: float = 0.0
     hard_iron_time: float = 30.0
     iron_sigma: float = 0.004
+    unshown_iron_sigma: float = 0.0
     step: float = 0.03
     heading_interval: float = 0.15
     attitude_sigma: float = 3.0 * DEGREE
@@ -125,6 +130,7 @@ class AhrsParameters:
             "rate_random_walk",
             "rest_bias_sigma",
             "tilt_sigma",
+            "unshown_iron_sigma",
             "usual_variation",
             "velocity_sigma",
         )
@@ -133,6 +139,11 @@ class AhrsParameters:
         for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma"}:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
+
+    @property
+    def first_iron_sigma(self) -> float:
+        """σ of all iron, each component, relative to the magnitude of the field, before the unit rotates."""
+        return math.hypot(self.iron_sigma, self.unshown_iron_sigma)
 
     @functools.cached_property
     def setup(self) -> FilterSetup:
@@ -178,6 +189,7 @@ HAND_HELD = AhrsParameters(
     specific_force_noise=0.06,
     field_disturbance=0.025,
     hard_iron_sigma=0.04,
+    unshown_iron_sigma=0.04,
     bias_sigma=2.0 * DEGREE,
     rest_bias_sigma=0.05 * DEGREE,
     velocity_sigma=0.7,

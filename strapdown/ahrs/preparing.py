@@ -51,13 +51,14 @@ def prepare(
     *,
     causal: bool = True,
     turned: Array | None = None,
+    at_rest: starting.Rests = starting.NO_REST,
 ) -> Prepared:
     """Return the record that the filter runs on, and its initial state.
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
     by the gyro. ``causal``: a heading's noise depends only on the samples up to it, and on ``turn_variance``, the variance of the rotation
     about each body axis over each sample interval in addition to the gyro's noise, rad² (n − 1, 3). ``turned`` (n, 4): attitude from the
-    gyro only, if already computed.
+    gyro only, if already computed. ``at_rest``: rests that show the gyro's bias.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
@@ -92,11 +93,13 @@ def prepare(
         field, counted = sums(recording.magnetic_field, frame, edge)
         skipped["magnetometer"] = missing(recording.magnetic_field, counted)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
+        variance = added.max(axis=1)
+        variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
         if causal:
-            variance = added.max(axis=1)
-            variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
+            before = np.searchsorted(at_rest.last, edge[1:])
+            bias = np.concatenate([np.zeros((1, 3)), at_rest.bias])[before]
             rows = kernel.Steps(
-                field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance
+                field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance, bias
             )
             heading = headings.online(rows, float(time[0]), parameters, step)
         else:
@@ -105,9 +108,13 @@ def prepare(
                 frame=middle,
                 length=counted * interval,
                 force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
-                at_edge=turned[edge],
+                end=turned[edge[1:]],
                 time=time,
+                turn_variance=variance,
             )
+            if len(at_rest.last):
+                columns = [np.interp(time[1:], recording.time[at_rest.last], axis) for axis in at_rest.bias.T]
+                samples = samples.without_drift(np.stack(columns, axis=-1), step)
             heading = headings.smoothed(samples, parameters)
         vectors.append(heading.vectors)
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())

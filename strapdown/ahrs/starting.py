@@ -171,9 +171,11 @@ class Rests(NamedTuple):
     gained: Array
     """Variance that the bias has gained since the rest before and the filter does not model (m,), (rad/s)²; infinite if a rest shows no
     more than is known: a long one is measured once, and again as the bias drifts."""
+    bias: Array
+    """Bias by all rests so far (m, 3), rad/s."""
 
 
-NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0))
+NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)))
 
 
 def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
@@ -184,13 +186,19 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     memory.rest_clock[1] = recording.time[0]
     length = constants.parts * constants.part
     n = len(recording.time) // length
-    means = kernel.Means(np.empty((n, 3)), np.empty(n), np.empty(n))
+    means = kernel.Means(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty((n, 3)))
     field = np.empty((0, 3)) if recording.magnetic_field is None else recording.magnetic_field
     assert recording.specific_force is not None
     samples = recording.time, recording.rate, recording.specific_force, field
     compiled(kernel.find_rests)(constants, *map(read_only, samples), memory, means)
     (quiet,) = np.nonzero(np.isfinite(means.variance))
-    return Rests(length * (quiet + 1) - 1, means.rate[quiet], np.sqrt(means.variance[quiet]), means.gained[quiet])
+    return Rests(
+        last=length * (quiet + 1) - 1,
+        rate=means.rate[quiet],
+        sigma=np.sqrt(means.variance[quiet]),
+        gained=means.gained[quiet],
+        bias=means.bias[quiet],
+    )
 
 
 def rest_length(interval: float) -> tuple[int, int]:

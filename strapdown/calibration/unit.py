@@ -155,6 +155,21 @@ class UnitCalibration(SensorErrors, Listed):
         """Root mean square of the standard deviations of the entries of the gyro's matrix; 0: unknown."""
         return float(np.sqrt(np.mean(self.sigma.gyro_matrix**2)))
 
+    def iron_sigma(self, recording: Recording) -> float:
+        """Return σ of the hard iron.
+
+        Parameters
+        ----------
+        recording : Recording
+            Recording of the same unit.
+
+        Returns
+        -------
+        float
+            Root mean square of the standard deviations of its components, in the unit of the recording's field; 0: unknown.
+        """
+        return float(np.sqrt(np.mean(self.sigma.hard_iron**2))) * self._unit_ratio(recording)
+
     def applied(self, recording: Recording) -> Recording:
         """Return a recording of the same unit with its samples corrected; the delays are left to the estimator.
 

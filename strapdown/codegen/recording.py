@@ -172,6 +172,8 @@ def init(f: Any) -> Any:
         for array in (f.counted, f.sums, f.iron, f.total, f.start):
             for i in range(len(array)):
                 array[i] = 0
+        for i in range(4):
+            f.drift[i] = 1.0 if i == 0 else 0.0
     if r.imu.rests:
         rests.clear_span(f)
         f.resting[1] = 0
@@ -232,7 +234,7 @@ def begin(f: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any) -
         if not 1.0 - sine * sine > MIN_HORIZONTAL_SQUARED:
             return body.NO_HEADING
         heading = first_state.heading_variance(constants, sine, tilt)
-        iron = first_state.iron_variance(parameters.iron_sigma, sine)
+        iron = first_state.iron_variance(parameters.first_iron_sigma, sine)
     else:
         across = first_state.least_axis(accelerometer)
     q, up = first_state.first_attitude(accelerometer, across), first_state.direction(accelerometer)

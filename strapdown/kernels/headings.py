@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import (
+    cross,
     dot,
     factored,
     matrix_times_vector,
@@ -20,7 +21,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.measurement import quaternion_at, vector_at
-from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
+from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.state import store_row
 
 NO_EQUATIONS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -59,6 +60,8 @@ class Constants(NamedTuple):
     field_disturbance: float
     field_deviation: float
     iron_sigma: float
+    iron_prior: float
+    """Variance of each component of the iron that no rotation has shown, relative to the squared magnitude."""
 
 
 class Steps(NamedTuple):
@@ -81,11 +84,15 @@ class Steps(NamedTuple):
     """Time of the end, s (k,)."""
     turn_variance: np.ndarray
     """Largest variance of the rotation by the gyro about an axis over the step in addition to its noise, rad²: gaps, clipping (k,)."""
+    bias: np.ndarray
+    """Bias of the gyro by the rests before (k, 3), rad/s; 0: no rest yet."""
 
 
 class Memory(NamedTuple):
     """What lasts from one step to the next."""
 
+    drift: np.ndarray
+    """Rotation (4,) that removes the drift of the frame fixed by the gyro since the start, as far as rests have shown the bias."""
     counted: np.ndarray
     """1 with a field, 2 with a force, 3 with both so far; steps since there were both, and since the last uncertain rotation (3,)."""
     start: np.ndarray
@@ -159,11 +166,12 @@ def added(rows, k, values):
     return tuple(rows[k, i] + value for i, value in enumerate(values))
 
 
-def iron_of_all(constants, field, frame, known, time, strength, before, iron):
-    """Write the iron (k, 3) by the changes before and after each row; ``before`` (k, 9) is scratch.
+def iron_of_all(constants, rows, strength, before, iron, unshown):
+    """Write the iron (k, 3) by the changes before and after each row, and its variance (k,); ``before`` (k, 9) is scratch.
 
-    ``field`` (k, 3) is in the frame fixed by the gyro, ``frame`` (k, 4) the attitude by it.
+    That variance is of the iron across the field (:func:`variance_across`).
     """
+    field, up, frame, known, time = rows
     sums = NO_EQUATIONS
     for k in range(len(time)):
         equations = equations_until(constants, field, frame, known, time, strength, k)
@@ -174,33 +182,62 @@ def iron_of_all(constants, field, frame, known, time, strength, before, iron):
         if k + constants.lag < len(time):
             equations = equations_until(constants, field, frame, known, time, strength, k + constants.lag)
             sums = approached(constants.iron_share, sums, equations)
-        store_row(iron, k, iron_of(constants, added(before, k, sums), strength))
+        total = added(before, k, sums)
+        factor = normal_factor(constants, total)
+        store_row(iron, k, iron_of(constants, factor, total, strength))
+        R = rotation_matrix(quaternion_at(frame, k))
+        unshown[k] = variance_across(constants, factor, R, vector_at(field, k), vector_at(up, k))
 
 
 def heading_step(constants, steps, memory, out, k):
     """Process step k."""
+    drift = drift_after(constants.step, steps.bias, steps.frame, memory.drift, k)
+    C = rotation_matrix(drift)
     known = steps.number[k] > 0.0
     if known:
-        store_row(memory.held, 0, scale(1.0 / steps.number[k], vector_at(steps.field, k)))
+        store_row(memory.held, 0, matrix_times_vector(C, scale(1.0 / steps.number[k], vector_at(steps.field, k))))
         memory.counted[0] |= 1
     if steps.force_number[k] > 0.0:
-        store_row(memory.held, 1, scale(1.0 / steps.force_number[k], vector_at(steps.force, k)))
+        store_row(memory.held, 1, matrix_times_vector(C, scale(1.0 / steps.force_number[k], vector_at(steps.force, k))))
         memory.counted[0] |= 2
     out.sigma[k] = 0.0
     store_row(out.iron, k, (0.0, 0.0, 0.0))
     out.usual[k, 0], out.usual[k, 1] = 1.0, 0.0
+    unshown = constants.iron_prior
     if memory.counted[0] == 3:
-        look_at_field(constants, steps, memory, out, k, known)
+        unshown = look_at_field(constants, steps, memory, out, k, known, drift)
         memory.counted[1] += 1
-    across = constants.iron_sigma / math.cos(out.usual[k, 1])
-    out.variance[k] = across * across
-    close_heading(constants, steps, memory, out, k)
+    level = math.cos(out.usual[k, 1])
+    out.variance[k] = (constants.iron_sigma * constants.iron_sigma + unshown) / (level * level)
+    close_heading(constants, steps, memory, out, k, drift)
 
 
-def look_at_field(constants, steps, memory, out, k, known):
-    """Add the direction of the field of step k to the heading, with the information that its deviation leaves."""
+def drift_after(step, bias, frame, drift, k):
+    """Return the rotation that removes the drift of the frame fixed by the gyro until step k, and write it in ``drift`` (4,).
+
+    That frame rotates with the bias (k, 3), without which the field of a unit at rest would seem to rotate and to be iron. ``step``:
+    interval of the steps, s.
+    """
+    rotation = matrix_times_vector(rotation_matrix(quaternion_at(frame, k)), vector_at(bias, k))
+    q = turned((drift[0], drift[1], drift[2], drift[3]), scale(-step, rotation))
+    for i in range(4):
+        drift[i] = q[i]
+    return q
+
+
+def drifts(step, bias, frame, drift, out):
+    """Write :func:`drift_after` of all steps (k, 4)."""
+    for k in range(len(frame)):
+        store_row(out, k, drift_after(step, bias, frame, drift, k))
+
+
+def look_at_field(constants, steps, memory, out, k, known, drift):
+    """Add the direction of the field of step k to the heading, with the information that its deviation leaves.
+
+    Returns the variance of the iron that turns the heading (:func:`variance_across`).
+    """
     field = vector_at(memory.held, 0)
-    frame = quaternion_at(steps.frame, k)
+    frame = quaternion_multiply(drift, quaternion_at(steps.frame, k))
     # After an uncertain rotation, directions before it are as uncertain in the frame fixed by the gyro: they are forgotten.
     variance = steps.turn_variance[k]
     forgotten = variance / (variance + constants.field_deviation * constants.field_deviation)
@@ -222,6 +259,7 @@ def look_at_field(constants, steps, memory, out, k, known):
     strength = memory.strength[0]
     iron = iron_step(constants, field, frame, known, steps.time[k], strength, memory)
     R = rotation_matrix(frame)
+    unshown = variance_across(constants, normal_factor(constants, memory.sums), R, field, up)
     look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up, forgotten)
     # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
     odds = min(max((memory.deviation[0] - memory.deviation[1]) / constants.deviation_odds, -50.0), 0.0)
@@ -240,19 +278,21 @@ def look_at_field(constants, steps, memory, out, k, known):
         noise = (
             relative * relative * (1.0 + memory.deviation[2] / (constants.field_deviation * constants.field_deviation))
         )
-        information = steps.length[k] / noise
+        information = 1.0 / (noise / steps.length[k] + variance)  # the step's samples may precede that rotation too
+        remaining = 1.0 / (1.0 + variance * memory.total[3])
         for i in range(3):
-            memory.total[i] += field[i] / size * information
-        memory.total[3] += information
+            memory.total[i] = remaining * memory.total[i] + field[i] / size * information
+        memory.total[3] = remaining * memory.total[3] + information
+    return unshown
 
 
-def close_heading(constants, steps, memory, out, k):
+def close_heading(constants, steps, memory, out, k, drift):
     """Write the heading measurement, if its interval ends with step k."""
     before = memory.start[1]
     memory.start[1] = math.floor((steps.time[k] + constants.step - memory.start[0]) / constants.heading_interval - 1e-6)
     total = (memory.total[0], memory.total[1], memory.total[2])
     if memory.start[1] != before and memory.total[3] > 0.0:
-        R = rotation_matrix(quaternion_at(steps.end, k))
+        R = rotation_matrix(quaternion_multiply(drift, quaternion_at(steps.end, k)))
         store_row(out.direction, k, transpose_times_vector(R, scale(1.0 / math.sqrt(dot(total, total)), total)))
         out.sigma[k] = 1.0 / math.sqrt(memory.total[3])
     if memory.start[1] != before:
@@ -336,8 +376,8 @@ def equations_of(field, frame, then, old, strength):
     )
 
 
-def iron_of(constants, sums, strength):
-    """Return the iron by low-passed equations, less what a field that varies along the path feigns."""
+def normal_factor(constants, sums):
+    """Return the factor of the normal matrix of the iron, from low-passed equations and the prior σ."""
     h, ridge = constants.iron_interval, constants.ridge
     normal = (
         h * sums[0] + ridge,
@@ -347,7 +387,23 @@ def iron_of(constants, sums, strength):
         h * sums[4],
         h * sums[5] + ridge,
     )
-    iron = solved(factored(normal), (h * sums[6], h * sums[7], h * sums[8]))
+    return factored(normal)
+
+
+def variance_across(constants, factor, R, field, up):
+    """Return the variance of the iron, relative to the squared magnitude, in the horizontal direction across the field.
+
+    Such iron turns the heading. Iron that no rotation has distinguished from the field of the surroundings is as uncertain as at first.
+    """
+    across = cross(field, up)
+    across = transpose_times_vector(R, scale(1.0 / math.sqrt(max(dot(across, across), 1e-30)), across))
+    return constants.iron_prior * constants.ridge * dot(across, solved(factor, across))
+
+
+def iron_of(constants, factor, sums, strength):
+    """Return the iron by low-passed equations, less what a field that varies along the path feigns."""
+    h = constants.iron_interval
+    iron = solved(factor, (h * sums[6], h * sums[7], h * sums[8]))
     less = 1.0 - constants.feigned * constants.feigned / max(dot(iron, iron), 1e-30)
     return scale(strength * max(less, 0.0), iron)
 
@@ -368,7 +424,7 @@ def iron_step(constants, field, frame, known, time, strength, memory):
     memory.ring_time[r] = time
     for i in range(9):
         sums[i] += constants.iron_share * (equations[i] - sums[i])
-    iron = iron_of(constants, sums, strength)
+    iron = iron_of(constants, normal_factor(constants, sums), sums, strength)
     for i in range(3):
         memory.iron[i] += constants.rise_share * (iron[i] - memory.iron[i])
     iron = (memory.iron[0], memory.iron[1], memory.iron[2])

@@ -77,6 +77,7 @@ PASSING = {
     "found_rate": ((1, 3), "", "mean rate at rest"),
     "found_rest": ((1,), "", "its variance"),
     "found_gained": ((1,), "", "variance that the bias has gained"),
+    "found_bias": ((1, 3), "", "bias by all rests so far"),
 }
 """Arrays that are written anew for each sample or step."""
 Arrays: Any = NamedTuple("Arrays", [(name, np.ndarray) for name in (*LASTING, *PASSING)])  # type: ignore[misc]

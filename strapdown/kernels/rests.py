@@ -68,6 +68,8 @@ class Means(NamedTuple):
     """Its variance (k,); infinite if it was no rest."""
     gained: np.ndarray
     """Variance that the bias has gained since the rest before and the filter does not model (k,); infinite if it shows no more."""
+    bias: np.ndarray
+    """Bias by all rests so far (k, 3), rad/s."""
 
 
 def find_rests(constants, time, rate, force, field, memory, means):
@@ -89,6 +91,7 @@ def find_rests(constants, time, rate, force, field, memory, means):
             store_row(means.rate, i // length, vector_at(memory.rest_rate, 0))
             means.variance[i // length] = memory.rest_variance[0]
             means.gained[i // length] = memory.rest_variance[3]
+            store_row(means.bias, i // length, vector_at(memory.rest_bias, 0))
 
 
 def add(sums, row, vector):

@@ -31,18 +31,25 @@ FEIGNED = 0.028
 """Apparent iron of a field that varies along the path, relative to its magnitude: estimates are multiplied by 1 − (apparent/estimate)²."""
 
 
-def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float) -> Array:
+def find(
+    field: Array, up: Array, frame: Array, known: np.ndarray, time: Array, strength: float, sigma: float
+) -> tuple[Array, Array]:
     """Return the hard iron at each row (k, 3), in the unit of the field and body axes, from the rows before and after it.
 
-    ``field`` (k, 3) is in the frame fixed by the integrated gyro, ``frame`` (k, 4) the attitude by the gyro, ``time`` (k,), s, with nearly
-    equal intervals, ``known`` (k,) the rows with a field. Online, the iron is part of :func:`strapdown.kernels.headings.heading_steps`.
+    Also returns the variance of the iron, relative to the squared magnitude, in the horizontal direction across the field (k,), from that
+    of a unit that has not rotated: ``sigma`` squared.
+
+    ``field`` and the vertical ``up`` (k, 3) are in the frame fixed by the integrated gyro, ``frame`` (k, 4) is the attitude by the gyro,
+    ``known`` (k,) the rows with a field, ``time`` (k,), s, has nearly equal intervals. Online, the iron is part of
+    :func:`strapdown.kernels.headings.heading_steps`.
     """
     interval = float(np.median(np.diff(time)))
-    others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
-    constants, result = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
-    rows = (read_only(column) for column in (field, frame, known, time))
-    compiled(headings.iron_of_all)(constants, *rows, strength, np.empty((len(time), 9)), result)
-    return result
+    others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1, "iron_prior": sigma * sigma}
+    constants, k = headings.Constants(**others | parts(interval)), len(time)
+    rows = tuple(read_only(column) for column in (field, up, frame, known, time))
+    iron, unshown = np.empty((k, 3)), np.empty(k)
+    compiled(headings.iron_of_all)(constants, rows, strength, np.empty((k, 9)), iron, unshown)
+    return iron, unshown
 
 
 def parts(interval: float) -> dict[str, Any]:
@@ -64,6 +71,7 @@ def parts(interval: float) -> dict[str, Any]:
 def memory(lag: int, capacity: int) -> headings.Memory:
     """Return the memory of the kernel at the start, with room for this number of values of each running median."""
     return headings.Memory(
+        drift=np.array([1.0, 0.0, 0.0, 0.0]),
         counted=np.zeros(3, np.int64),
         start=np.zeros(2),
         strength=np.zeros(1),
