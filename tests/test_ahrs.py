@@ -570,10 +570,14 @@ def test_a_long_rest_is_measured_until_it_says_no_more_than_is_known():
     np.testing.assert_array_equal(rests.gained[used], 0.0)
 
 
-def test_at_rest_the_heading_without_a_magnetometer_does_not_drift_with_the_bias():
+@pytest.mark.parametrize("smooth", [False, True])
+def test_at_rest_the_heading_without_a_magnetometer_does_not_drift_with_the_bias(smooth):
     """It changes by 0.1 °/s in 5 minutes, which makes 15°; the model's random walk is 0.01 °/s in that time."""
-    estimate = ahrs.estimate(lying(300, np.linspace(0.0, 0.1 * DEGREE, 3000))).estimate
-    assert np.ptp(estimate.rotation.as_euler("ZYX", degrees=True)[:, 0]) < 1.0
+    bias = np.linspace(0.0, 0.1 * DEGREE, 3000)
+    result = ahrs.estimate(lying(300, bias), smooth=smooth)
+    assert np.ptp(result.estimate.rotation.as_euler("ZYX", degrees=True)[:, 0]) < 1.0
+    np.testing.assert_allclose(result.estimate.bias[:, 2], bias, atol=0.02 * DEGREE)
+    np.testing.assert_array_equal(result.recording.rate[:, 2], bias)
 
 
 def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():

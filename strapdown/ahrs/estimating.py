@@ -16,6 +16,7 @@ from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
+    drift_by_rests,
     first_vector,
     for_whole,
     need_accelerometer,
@@ -143,23 +144,23 @@ def estimate(
     need_accelerometer(recording)
     samples_in_span(recording)  # rejects a recording that is too short
     faults = sensor_faults.find(recording)
-    used = faults.recording
+    samples = used = faults.recording
     if parameters is None:
         parameters = of_motion("hand", magnetometer=used.magnetic_field is not None, smooth=smooth)
     field_delay = None
     if calibration is not None:
-        used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
-        if parameters.gyro_scale_sigma > 0.0 < calibration.gyro_scale_sigma:
-            parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
-        if used.magnetic_field is not None and calibration.sigma.hard_iron.any():
-            size = lengths(used.magnetic_field)
-            sigma = calibration.iron_sigma(used) / median(size[np.isfinite(size)])
-            parameters = replace(parameters, unshown_iron_sigma=min(sigma, parameters.unshown_iron_sigma))
+        samples = used = calibration.applied(used)
+        field_delay, parameters = calibration.magnetometer_delay or None, _of_unit(parameters, calibration, used)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
+    drift: Array | float = 0.0
     if smooth:
         parameters = for_whole(used, parameters, at_rest)
+        if used.magnetic_field is None and len(at_rest.last) > 1:  # the filter's bias hardly drifts
+            drift = drift_by_rests(at_rest, used.time)
+            used = replace(used, rate=used.rate - drift)
+            at_rest, turned = rests(used, parameters), sensor_delays.gyro_attitude(used)
     else:
         at_rest = Rests(*(column[np.isfinite(at_rest.gained)] for column in at_rest))
     prepared = prepare(
@@ -171,8 +172,8 @@ def estimate(
     filtered = _run(prepared, parameters, at_rest, options)
     at_stamps = _at_stamps(filtered, used, prepared, parameters, delays, options)
     return AhrsEstimate(
-        recording=used,
-        estimate=at_stamps,
+        recording=samples,
+        estimate=replace(at_stamps, bias=at_stamps.bias + drift),
         applied=calibration,
         record=prepared.record,
         initial=prepared.initial,
@@ -182,6 +183,17 @@ def estimate(
         rests=at_rest,
         hard_iron=_iron_at_end(filtered, prepared),
     )
+
+
+def _of_unit(parameters: AhrsParameters, calibration: UnitCalibration, used: Recording) -> AhrsParameters:
+    """Return the parameters with what the calibration leaves uncertain of the unit that made the recording."""
+    if parameters.gyro_scale_sigma > 0.0 < calibration.gyro_scale_sigma:
+        parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
+    if used.magnetic_field is not None and calibration.sigma.hard_iron.any():
+        size = lengths(used.magnetic_field)
+        sigma = calibration.iron_sigma(used) / median(size[np.isfinite(size)])
+        parameters = replace(parameters, unshown_iron_sigma=min(sigma, parameters.unshown_iron_sigma))
+    return parameters
 
 
 def _iron_at_end(filtered: Estimate, prepared: Prepared) -> Array:

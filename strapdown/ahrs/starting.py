@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
@@ -39,6 +40,9 @@ MAX_TILT_SIGMA = 0.7
 BIAS_DRIFT = 3e-4
 """Least random walk of the gyro's bias between rests, rad/s/√s: that of the model with a magnetometer. Without one the filter's is smaller,
 so that acceleration is not treated as bias."""
+SLOW_DRIFT = 3e-5
+"""Random walk of the gyro's bias by which the smoother without a magnetometer follows all rests, rad/s/√s: 0.07 °/s in half an hour. With
+a larger one, slow turns that pass for rests would pass for drift."""
 VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
@@ -286,6 +290,22 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
         if square > MAX_DEVIATION**2:
             parameters = replace(parameters, accelerometer_bias_sigma=square**0.5)
     return parameters
+
+
+def drift_by_rests(at_rest: Rests, time: Array) -> Array:
+    """Return the change of the gyro's bias since the first rest, rad/s, at every sample (n, 3), by all spans at rest.
+
+    The bias at the rests is that of a random walk with :data:`SLOW_DRIFT`, smoothed; between them it changes linearly.
+    """
+    if len(at_rest.last) < 2:
+        return np.zeros((len(time), 3))
+    rested = time[at_rest.last]
+    apart, weight = 1.0 / (SLOW_DRIFT**2 * np.diff(rested)), at_rest.sigma**-2
+    normal = np.zeros((2, len(rested)))
+    normal[0] = weight + np.append(apart, 0.0) + np.append(0.0, apart)
+    normal[1, :-1] = -apart
+    bias = solveh_banded(normal, weight[:, None] * at_rest.rate, lower=True)
+    return np.stack([np.interp(time, rested, axis) for axis in (bias - bias[0]).T], axis=-1)
 
 
 def with_all_rests(
