@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+import strapdown
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, quaternion
 from strapdown.ahrs import AhrsParameters, estimating, regions, remarks, starting
@@ -687,6 +689,17 @@ def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
         for name in ("vehicle", "hand")
     )
     assert own < 3.5 < 3.0 * own < hand
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize(("motion", "said"), [("hand", True), ("vehicle", False)])
+def test_a_motion_that_does_not_suit_is_warned_of(motion, said, smooth):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ahrs.MotionWarning)
+        estimate = (strapdown.smooth if smooth else strapdown.estimate)(driven(), motion=motion)
+    words = [str(warning.message) for warning in caught if warning.category is ahrs.MotionWarning]
+    assert len(words) == said
+    assert any("lasts longer than modelled" in remark for remark in estimate.remarks) == said
 
 
 def test_a_vibrating_machine_needs_no_set_of_its_own():

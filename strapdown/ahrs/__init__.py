@@ -20,6 +20,7 @@ from strapdown.ahrs.parameters import of_motion as of_motion
 from strapdown.ahrs.preparing import Prepared as Prepared
 from strapdown.ahrs.preparing import prepare as prepare
 from strapdown.ahrs.preparing import without_temperature as without_temperature
+from strapdown.ahrs.remarks import MotionWarning
 from strapdown.ahrs.starting import need_accelerometer as need_accelerometer
 from strapdown.ahrs.starting import quiet_span as quiet_span
 from strapdown.ahrs.starting import start as start
@@ -32,5 +33,6 @@ __all__ = [
     "FieldComparison",
     "LiveAhrs",
     "MagneticField",
+    "MotionWarning",
     "estimate",
 ]

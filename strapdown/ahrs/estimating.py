@@ -74,6 +74,8 @@ class AhrsEstimate:
         Hard iron of the magnetometer at the end, body axes, in the unit of its samples.
     applied : UnitCalibration or None
         Calibration of the unit by which the samples were corrected.
+    force_density : float
+        Largest spectral density at low frequency of the accelerometer's innovations so far, relative to that of white ones.
     """
 
     recording: Recording
@@ -86,6 +88,7 @@ class AhrsEstimate:
     rests: Rests
     hard_iron: Array
     applied: UnitCalibration | None
+    force_density: float
 
     @property
     def calibration(self) -> UnitCalibration | None:
@@ -170,7 +173,8 @@ def estimate(
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, at_rest, options)
-    at_stamps = _at_stamps(filtered, used, prepared, parameters, delays, options)
+    density = regions.density(filtered, "accelerometer", max(parameters.step, used.interval), causal=not smooth)
+    at_stamps = _at_stamps(filtered, density, used, prepared, parameters, delays, options)
     return AhrsEstimate(
         recording=samples,
         estimate=replace(at_stamps, bias=at_stamps.bias + drift),
@@ -182,6 +186,7 @@ def estimate(
         faults=faults,
         rests=at_rest,
         hard_iron=_iron_at_end(filtered, prepared),
+        force_density=float(density.max()),
     )
 
 
@@ -273,19 +278,23 @@ def uncertain_turns(variance: Array) -> Array:
 
 def _at_stamps(
     filtered: Estimate,
+    density: Array,
     used: Recording,
     prepared: Prepared,
     parameters: AhrsParameters,
     delays: Delays,
     options: _Options,
 ) -> Estimate:
-    """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
+    """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay.
+
+    ``density`` (k + 1,): that of the accelerometer's innovations (:func:`regions.density`).
+    """
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = (np.empty((n, width)) for width in (4, 3, 6))
     P = np.empty((n if options.full_covariance else 0, 6, 6))
     ahead = -sensor_delays.turn_over(used, -delays.gyro) if options.smooth else used.rate * delays.gyro
     interval = max(parameters.step, used.interval)
-    scales = regions.scales(filtered, parameters, interval, causal=not options.smooth)
+    scales = regions.scales(filtered, density, parameters, causal=not options.smooth)
     level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))

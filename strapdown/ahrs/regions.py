@@ -62,12 +62,11 @@ def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovation
     return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}
 
 
-def scales(filtered: Estimate, parameters: AhrsParameters, interval: float, *, causal: bool) -> tuple[Array, Array]:
+def scales(filtered: Estimate, force: Array, parameters: AhrsParameters, *, causal: bool) -> tuple[Array, Array]:
     """Return the factors on σ of tilt and heading at each edge of the steps (k + 1,), from the innovations before it, or from all.
 
-    ``interval``: that of the steps, s.
+    ``force`` (k + 1,): :func:`density` of the accelerometer's.
     """
-    force = density(filtered, "accelerometer", interval, causal=causal)
     field = density(filtered, "magnetometer", parameters.heading_interval, causal=causal)
     tilt, heading = np.empty((2, len(force)))
     constants = scales_of(parameters)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import ahrs, quaternion, records, units
-from strapdown.ahrs.remarks import fixed_frame, remarks
+from strapdown.ahrs.remarks import fixed_frame, remarks, warn
 from strapdown.checks import Hint, InputError, array, count, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
@@ -113,6 +113,8 @@ def estimate(
     -----
     strapdown.ahrs.ConventionWarning
         If units, axes or signs of a recording seem wrong.
+    strapdown.ahrs.MotionWarning
+        If the model of the motion does not suit a recording.
 
     Examples
     --------
@@ -123,7 +125,10 @@ def estimate(
     options = locals()
     if isinstance(source, Recording):
         ahrs.check_conventions.warn(source)
-    return run(**options).estimate
+    result = run(**options)
+    if result.recorded is not None:
+        warn(result.recorded, result.estimate.motion)
+    return result.estimate
 
 
 def smooth(
@@ -160,6 +165,11 @@ def smooth(
     InputError
         As for :func:`estimate`, or if the record is too long for the memory.
 
+    Warns
+    -----
+    strapdown.ahrs.ConventionWarning, strapdown.ahrs.MotionWarning
+        As for :func:`estimate`.
+
     References
     ----------
     H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
@@ -173,7 +183,10 @@ def smooth(
     options = locals()
     if isinstance(source, Recording):
         ahrs.check_conventions.warn(source)
-    return run(**options, smooth=True).estimate
+    result = run(**options, smooth=True)
+    if result.recorded is not None:
+        warn(result.recorded, result.estimate.motion)
+    return result.estimate
 
 
 def run(
