@@ -268,8 +268,9 @@ class LiveAhrs:
         if code < 0:
             self._refuse(code)
         if code == kernel.RESTED:
-            rate, (variance, _, _, gained) = self._rests.rest_rate[0], self._rests.rest_variance.tolist()
-            measured = {"rate": rate, "sigma": math.sqrt(variance), "gained": gained}
+            rests = self._rests
+            rate, sigma, gained = rests.rest_rate[0], math.sqrt(rests.rest_variance[0]), float(rests.rest_gained[0])
+            measured = {"rate": rate, "sigma": sigma, "gained": gained}
             change(self._filter, functools.partial(starting.take_rate_at_rest, **measured))
             self._imu.resting[1] = 0
 

@@ -238,8 +238,11 @@ def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
         halves_number=np.zeros(4, np.int64),
         resting=np.zeros(2, np.int64),
         rest_rate=np.zeros((1, 3)),
-        rest_variance=np.array([np.inf, parameters.bias_sigma**2, FIRST_BIAS_SIGMA**2, np.inf]),
+        rest_variance=np.array([np.inf]),
+        rest_gained=np.array([np.inf]),
         rest_bias=np.zeros((1, 3)),
+        bias_variance=np.array([parameters.bias_sigma**2]),
+        plausible_variance=np.array([FIRST_BIAS_SIGMA**2]),
         rest_clock=np.zeros(2),
     )
 

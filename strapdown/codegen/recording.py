@@ -177,7 +177,7 @@ def init(f: Any) -> Any:
     if r.imu.rests:
         rests.clear_span(f)
         f.resting[1] = 0
-        f.rest_variance[1], f.rest_variance[2] = r.parameters.bias_sigma**2, starting.FIRST_BIAS_SIGMA**2
+        f.bias_variance[0], f.plausible_variance[0] = r.parameters.bias_sigma**2, starting.FIRST_BIAS_SIGMA**2
         for i in range(3):
             f.rest_bias[0, i] = 0.0
     return body.OK
@@ -303,7 +303,7 @@ def use_rest(f: Any) -> None:
     k, n, work = f.kernels, f.program.n, f.work
     k.clear_step(work, 0.0)
     for i in range(3, 6):
-        f.P[body.place(n, i, i)] += f.rest_variance[3]
+        f.P[body.place(n, i, i)] += f.rest_gained[0]
     for i in range(3):
         for j in range(n):
             work[k.LINE * k.ROWS + j] = 1.0 if j == 3 + i else 0.0

@@ -52,9 +52,15 @@ class Memory(NamedTuple):
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
-    """Its variance, infinite if it was no rest; that of the bias by all rests, drifting or not; the drift that is not modelled (4,)."""
+    """Its variance; infinite if it was no rest (1,)."""
+    rest_gained: np.ndarray
+    """Variance that the bias has gained since the rest before and the filter does not model; infinite if this one shows no more (1,)."""
     rest_bias: np.ndarray
     """Bias by all rests (1, 3), rad/s."""
+    bias_variance: np.ndarray
+    """Its variance (1,)."""
+    plausible_variance: np.ndarray
+    """The same, but at first that of any unit: a mean rate that departs by more is a turn (1,)."""
     rest_clock: np.ndarray
     """Time of the first sample of the span, and of the last rest, s (2,)."""
 
@@ -90,7 +96,7 @@ def find_rests(constants, time, rate, force, field, memory, means):
             clear_span(memory)
             store_row(means.rate, i // length, vector_at(memory.rest_rate, 0))
             means.variance[i // length] = memory.rest_variance[0]
-            means.gained[i // length] = memory.rest_variance[3]
+            means.gained[i // length] = memory.rest_gained[0]
             store_row(means.bias, i // length, vector_at(memory.rest_bias, 0))
 
 
@@ -137,7 +143,7 @@ def find_rest(constants, time, memory):
     variance = constants.own_variance + spread / parts
     bias = vector_at(memory.rest_bias, 0)
     change = combine(1.0, rate, -1.0, bias)
-    changed = dot(change, change) > constants.odds * (variance + memory.rest_variance[2])
+    changed = dot(change, change) > constants.odds * (variance + memory.plausible_variance[0])
     # Unless the new rate is less than half of that bias, which then was a turn itself.
     turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
     with_force, square_force = turned_with(constants, rate, memory, 0)
@@ -152,13 +158,13 @@ def find_rest(constants, time, memory):
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
     since = time - memory.rest_clock[1]
-    drifted = memory.rest_variance[1] + constants.walk * since
-    memory.rest_variance[3] = math.inf
+    drifted = memory.bias_variance[0] + constants.walk * since
+    memory.rest_gained[0] = math.inf
     if still and variance < drifted:
         memory.resting[1] = 1
-        memory.rest_variance[3] = constants.unmodelled * since
+        memory.rest_gained[0] = constants.unmodelled * since
         memory.rest_clock[1] = time
-        memory.rest_variance[1] = memory.rest_variance[2] = 1.0 / (1.0 / drifted + 1.0 / variance)
+        memory.bias_variance[0] = memory.plausible_variance[0] = 1.0 / (1.0 / drifted + 1.0 / variance)
         store_row(memory.rest_bias, 0, combine(1.0, bias, drifted / (drifted + variance), change))
 
 
