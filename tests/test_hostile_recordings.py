@@ -1,12 +1,10 @@
-"""Recordings of other programs that are damaged or made to harm: refused by name, in time and within memory, or read up to the fault."""
+"""Recordings of other programs that are damaged or made to harm: refused by name, in time and within memory."""
 
-import bz2
 import contextlib
 import dataclasses
 import os
 import resource
 import signal
-import sqlite3
 import struct
 import threading
 import time
@@ -20,7 +18,7 @@ from ulog_writer import write_ulog
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.recordings import attitudes, bag_files, ros, trajectories, ulog
+from strapdown.recordings import attitudes, trajectories, ulog
 
 SECONDS = 8.0
 MEGABYTES = 1000.0
@@ -94,154 +92,6 @@ def test_a_log_with_a_changed_name_of_a_field_is_refused_by_the_field(tmp_path):
         damaged.parent.mkdir(exist_ok=True)
         damaged.write_bytes(path.read_bytes().replace(old, new))
         refused(damaged, words)
-
-
-# ---------------------------------------------------------------------------------------------------------------------- bags
-
-
-def ros1_record(op: int, fields: dict[bytes, bytes], content: bytes) -> bytes:
-    header = b"".join(
-        struct.pack("<I", len(key) + 1 + len(value)) + key + b"=" + value
-        for key, value in {b"op": bytes([op]), **fields}.items()
-    )
-    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(content)) + content
-
-
-def ros1_chunk(compression: bytes, packed: bytes, size: int) -> bytes:
-    fields = {b"compression": compression, b"size": struct.pack("<I", size)}
-    return bag_files.ROS1 + ros1_record(5, fields, packed)
-
-
-def test_what_a_chunk_unpacks_to_is_limited_before_memory_is_spent(tmp_path, monkeypatch):
-    path = tmp_path / "bomb.bag"
-    packed = bz2.compress(bytes(80_000_000))
-    assert len(packed) < 1000
-    path.write_bytes(ros1_chunk(b"bz2", packed, 80_000_000))
-    refused(path, r"bomb\.bag unpacks to more than its limit, 64 MB left and 80 MB to come.*STRAPDOWN_MAX_MB")
-    path.write_bytes(ros1_chunk(b"bz2", packed, 1000))  # it declares less than it has
-    refused(path, "its compressed data are truncated, or have more than 1000 bytes")
-    monkeypatch.setenv("STRAPDOWN_MAX_MB", "100")
-    path.write_bytes(ros1_chunk(b"bz2", packed, 80_000_000))
-    with pytest.raises(InputError, match="no complete message"):
-        recordings.read(path)
-
-
-@pytest.mark.parametrize("compression", ["lz4", "zstd"])
-def test_chunks_of_mcap_are_limited_alike(tmp_path, compression):
-    zstd, lz4 = pytest.importorskip("backports.zstd"), pytest.importorskip("lz4.frame")
-    packed = {"zstd": zstd, "lz4": lz4}[compression].compress(bytes(80_000_000))
-    path = tmp_path / "bomb.mcap"
-    for size, words in ((80_000_000, "unpacks to more than its limit"), (1000, "have more than 1000 bytes")):
-        name = struct.pack("<I", len(compression)) + compression.encode()
-        chunk = struct.pack("<QQQI", 0, 0, size, 0) + name + struct.pack("<Q", len(packed)) + packed
-        path.write_bytes(bag_files.MCAP + struct.pack("<BQ", 6, len(chunk)) + chunk)
-        refused(path, words)
-    whole = tmp_path / "whole.mcap.zstd"
-    whole.write_bytes(zstd.compress(bag_files.MCAP + bytes(80_000_000)))
-    refused(whole, r"have more than 64000000 bytes", lambda path: ros.topics_of(path, ros.READ))
-
-
-def database(path, *statements: str) -> None:
-    path.unlink(missing_ok=True)
-    with contextlib.closing(sqlite3.connect(path)) as held:
-        for statement in statements:
-            held.execute(statement)
-        held.commit()
-
-
-TOPICS = "CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type)"
-MESSAGES = "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)"
-ENDLESS = (
-    "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
-    "SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
-)
-MESSAGE = "INSERT INTO messages VALUES (1, 1, 1, x'00')"
-GENERATED = MESSAGES.replace("data)", "data AS (zeroblob(900000000)))")
-SHORT = GENERATED.replace("900000000", "4000")
-ROWS = (
-    "INSERT INTO messages (id, topic_id, timestamp) "
-    "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 3000) SELECT i, 9, i FROM n"
-)
-UNIT = "INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu')"
-
-
-@pytest.mark.parametrize(
-    ("statements", "words"),
-    [
-        ([TOPICS, UNIT, f"CREATE VIEW messages AS {ENDLESS}"], "it has no table messages"),
-        ([MESSAGES, f"CREATE VIEW topics AS {ENDLESS}"], "it has no table topics"),
-        ([TOPICS, UNIT, GENERATED, "INSERT INTO messages VALUES (1, 1, 1)"], "too big|not authorized"),
-        ([TOPICS, UNIT, SHORT, ROWS], "its rows are longer than the file, so a column is generated|not authorized"),
-        ([TOPICS, UNIT, MESSAGES, "INSERT INTO messages VALUES (1, 1, NULL, 'text')"], "1 messages are of no topic"),
-        ([TOPICS, UNIT.replace("'/imu'", "NULL"), MESSAGES, MESSAGE], "1 messages are of no topic"),
-        ([TOPICS, UNIT.replace("'/imu'", "CAST(x'ff' AS TEXT)"), MESSAGES, MESSAGE], "topic �: message 1 is 1 bytes"),
-        (["CREATE TABLE other (a)"], "it has no table topics"),
-    ],
-)
-def test_databases_of_hostile_content_are_refused(tmp_path, statements, words):
-    path = tmp_path / "hostile.db3"
-    database(path, *statements)
-    refused(path, words)
-
-
-def test_rows_of_wrong_types_are_left_out_and_reported(tmp_path):
-    pytest.importorskip("rosbags")
-    path = tmp_path / "rows.db3"
-    whole = dataclasses.replace(walk(), magnetic_unit="T", movement=None)
-    recordings.write(whole, path)
-    for change in ("data = 'text'", "timestamp = 'soon'", "topic_id = 99"):
-        damaged = tmp_path / "damaged.db3"
-        damaged.write_bytes(path.read_bytes())
-        with contextlib.closing(sqlite3.connect(damaged)) as held:
-            held.execute(f"UPDATE messages SET {change} WHERE id = (SELECT min(id) FROM messages WHERE topic_id = 1)")
-            held.commit()
-        recording = recordings.read(damaged)
-        np.testing.assert_array_equal(recording.rate, whole.rate[1:])
-        assert "1 messages are of no topic" in " ".join(recording.remarks)
-
-
-def test_a_folder_whose_storage_is_a_pipe_is_refused_at_once(tmp_path):
-    folder = tmp_path / "bag"
-    folder.mkdir()
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  relative_file_paths:\n    - bag_0.mcap\n")
-    os.mkfifo(folder / "bag_0.mcap")
-    refused(folder, r"bag_0\.mcap is not a regular file but a pipe")
-    (folder / "bag_0.mcap").unlink()
-    refused(folder, r"bag_0\.mcap of its metadata\.yaml is missing.*no complete message")
-
-
-def test_reading_a_bag_takes_time_in_proportion_to_its_topics(tmp_path):
-    """Each with one message: the messages were sorted out topic by topic."""
-    path = tmp_path / "topics.bag"
-
-    def bag(number: int) -> float:
-        records = [bag_files.ROS1]
-        definition = b"".join(
-            struct.pack("<I", len(field)) + field for field in (b"type=sensor_msgs/Imu", b"message_definition=")
-        )
-        for k in range(number):
-            conn = struct.pack("<I", k)
-            records.append(ros1_record(7, {b"conn": conn, b"topic": b"/%d" % k}, definition))
-            records.append(ros1_record(2, {b"conn": conn, b"time": bytes(8)}, b""))
-        path.write_bytes(b"".join(records))
-        begun = time.process_time()
-        with pytest.raises(InputError, match=r"topics\.bag has several inertial units"):
-            recordings.read(path)
-        return time.process_time() - begun
-
-    bag(10)
-    assert bag(10_000) < 30.0 * max(bag(1_000), 0.01)
-
-
-def test_a_written_mcap_has_checksums_and_damage_is_left_out(tmp_path):
-    pytest.importorskip("rosbags")
-    whole = dataclasses.replace(walk(), magnetic_unit="T", movement=None)
-    path = tmp_path / "walk.mcap"
-    recordings.write(whole, path)
-    content = path.read_bytes()
-    at = content.index(whole.rate[30].tobytes()) + 3
-    path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-    refused(path, "a chunk does not match its checksum and is left out.*no complete message")
 
 
 # -------------------------------------------------------------------------------------------------------------------- Parquet

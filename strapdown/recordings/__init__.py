@@ -3,8 +3,8 @@
 A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :func:`strapdown.read` and
 :func:`strapdown.write` read and write it, and :mod:`strapdown.ahrs` estimates attitude from it.
 
-Own HDF5 files have a digest, MCAP and Parquet checksums, which are verified: a changed bit is noticed. CSV, TUM, ULog, ROS 1 bags and
-SQLite have none: one changed bit of a sample is another sample.
+Own HDF5 files have a digest and Parquet checksums, which are verified: a changed bit is noticed. In CSV, TUM, ULog and bags one changed bit
+of a sample is another sample.
 
 - ``formats``: The table of formats, :data:`FORMATS`: reading by content, writing by file extension.
 - ``body_axes``: Axes and signs that differ from the package's: :func:`with_axes`.

@@ -341,7 +341,7 @@ def _unit(name: str, q: Array) -> Array:
 
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
-    topics, _, words = ros.topics_of(path, ros.ORIENTED)
+    topics = ros.topics_of(path, ros.ORIENTED)
     oriented = ros.topic_of(path.name, topics, topic, "topics with orientations", list(ros.ORIENTED))
     stamps, values, order_words = oriented.decoded(path.name)
     q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
@@ -351,7 +351,7 @@ def _bag(path: Path, topic: str) -> Attitudes:
     stamps, q, P = stamps[known], q[known], P[known]
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
     count = f"Topic {oriented.name}: {int(fresh.sum())} orientations of {len(oriented)} messages."
-    remarks = [count, *words, *order_words]
+    remarks = [count, *order_words]
     covariance = None
     if P.any():
         covariance = (P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3))[fresh]

@@ -16,7 +16,7 @@ import numpy as np
 
 from strapdown.checks import Hint, InputError, one_of
 from strapdown.files import reading
-from strapdown.recordings import bag_files, broad, dataframes, delimited, ros, telemetry, trajectories, ulog
+from strapdown.recordings import broad, dataframes, delimited, ros, telemetry, trajectories, ulog
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord, outputs
 from strapdown.records.recording import Recording, matched, with_gyro
@@ -68,7 +68,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="ROS bag",
         endings=(".bag", ".mcap", ".db3"),
-        recognised=lambda path, head: bag_files.is_folder(path) or head.startswith(bag_files.MAGICS),
+        recognised=lambda path, head: (path / "metadata.yaml").is_file() or head.startswith(ros.BEGINNINGS),
         read=ros.read_bag,
         options=("topic",),
         write=ros.write_bag,

@@ -9,8 +9,7 @@ headers' stamps, ns; if these are all zero, that of the recorder. Stamps out of 
 The covariance of the orientation is written about the axes of the fixed frame, as REP 103 defines it for poses: ``R P Rᵀ`` of the filter's
 body-side covariance. At stamps without an estimate the first element is −1.
 
-The messages have a fixed layout after the name of their frame, so they are decoded as arrays. Files of bags are read by
-:mod:`strapdown.recordings.bag_files`; of a truncated or damaged bag the complete messages are read. The library only writes.
+The library reads and writes the bags. The messages have a fixed layout after the name of their frame, so they are decoded here as arrays.
 """
 
 from __future__ import annotations
@@ -27,10 +26,14 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, one_of
+from strapdown.files import reading
 from strapdown.files.extras import library
-from strapdown.recordings.bag_files import Add, Bag, Data, write_checksums
 from strapdown.records import Estimate
 from strapdown.records.recording import Recording, beside, field_in, matched, relative_time, with_gyro
+
+ROS1 = b"#ROSBAG V2.0\n"
+BEGINNINGS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
+"""First bytes of the kinds of files."""
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",
@@ -59,23 +62,25 @@ BATCH = 1024
 
 @dataclass(eq=False)
 class Topic:
-    """The messages of one topic in the order of the bag: decoded, or raw if they are to be copied."""
+    """The messages of one topic in the order of the recorder's times: decoded, or raw if they are to be copied."""
 
     name: str
     kind: str
-    ros2: bool = True
+    ros2: bool
+    definition: str = ""
+    """Definition of the messages' type that the bag has."""
     span: tuple[int, int] | None = None
     """Range of the doubles to decode; None: the messages remain raw."""
     logged: list[int] = field(default_factory=list)
     """Times of the recorder, ns."""
-    raw: list[Data] = field(default_factory=list)
+    raw: list[bytes] = field(default_factory=list)
     """Messages that are not decoded."""
     parts: list[tuple[NDArray[np.int64], Array]] = field(default_factory=list)
     """Stamps, ns, and numbers of the messages, by batch."""
     fault: str = ""
     """Fault of the first message that cannot be decoded."""
 
-    def add(self, logged: int, data: Data) -> None:
+    def add(self, logged: int, data: bytes) -> None:
         """Append a message."""
         self.raw.append(data)
         self.logged.append(logged)
@@ -99,22 +104,18 @@ class Topic:
         if self.fault:
             raise InputError(f"{source}, topic {self.name}: {self.fault}; the bag is damaged or of another type")
         stamps, values = (np.concatenate(column) for column in zip(*self.parts, strict=True))
-        logged = np.array(self.logged, np.int64)
-        order = np.argsort(logged, kind="stable")
-        logged, stamps, values = logged[order], stamps[order], values[order]
-        said = []
+        remarks = []
         if not stamps.any() and len(stamps) > 1:
-            stamps = logged
-            said.append(f"The headers of {self.name} have no stamps: time is that of the recorder.")
-        back = int(np.sum(np.diff(stamps) < 0))
-        if back:
-            number = int(np.argmax(np.diff(stamps) < 0)) + 2
+            stamps = np.array(self.logged, np.int64)
+            remarks.append(f"The headers of {self.name} have no stamps: time is that of the recorder.")
+        back = np.diff(stamps) < 0
+        if back.any():
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
-            said.append(
-                f"{back} messages of {self.name}, the first of them number {number}, were out of order and were sorted."
+            remarks.append(
+                f"{back.sum()} messages of {self.name}, the first of them number {np.argmax(back) + 2}, were out of order and were sorted."
             )
-        return stamps, values, said
+        return stamps, values, remarks
 
     def __len__(self) -> int:
         """Return the number of messages."""
@@ -126,10 +127,10 @@ class Topic:
 
 def read_bag(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
-    topics, _, remarks = topics_of(file, READ)
+    topics = topics_of(file, READ)
     topic_name = topic_of(file.name, topics, topic, "inertial units", [IMU]).name
     stamps, values, order_words = topics[topic_name].decoded(file.name)
-    said = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks, *order_words]
+    said = [f"Topic {topic_name}: {len(stamps)} messages.", *order_words]
     if values[0, 3] == -1.0:
         raise InputError(
             f"{file.name}, topic {topic_name}: message 1 declares that it has no angular velocity; choose another topic"
@@ -184,7 +185,7 @@ def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str
 
 
 def _decoded(
-    raws: Sequence[Data], kind: str, span: tuple[int, int], ros2: bool, before: int
+    raws: Sequence[bytes], kind: str, span: tuple[int, int], ros2: bool, before: int
 ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (n,), ns, and a range of the doubles (n, d) of messages of a type; ``before`` is the number of earlier messages."""
     first, last = span
@@ -218,33 +219,31 @@ def _decoded(
     return stamps, values
 
 
-def topics_of(path: Path, spans: Mapping[str, tuple[int, int]]) -> tuple[dict[str, Topic], Bag, tuple[str, ...]]:
-    """Return the messages of a bag by topic, the bag, and remarks on what is missing.
+def topics_of(path: Path, spans: Mapping[str, tuple[int, int]]) -> dict[str, Topic]:
+    """Return the messages of a bag by topic.
 
     ``spans`` are the types to read, with the range of their doubles; if it is empty, all messages are returned raw.
     """
-    bag = Bag(path)
+    ros2 = path.is_dir()
+    if not ros2:
+        with reading.opened(path) as file:
+            ros2 = file.read(len(ROS1)) != ROS1
+    rosbag = library(f"rosbags.rosbag{2 if ros2 else 1}", f"{path.name} is a ROS bag, which")
     topics: dict[str, Topic] = {}
-
-    def receiver(name: str, kind: str) -> Add | None:
-        if spans and kind not in spans:
-            return None
-        topic = topics.setdefault(name, Topic(name, kind, bag.ros2, spans.get(kind)))
-        return topic.add if topic.kind == kind else None
-
-    bag.read(receiver)
-    number = sum(map(len, topics.values()))
-    words: tuple[str, ...] = ()
-    if bag.faults:
-        fault = f"cannot be read {'completely ' if number else ''}as a ROS bag ({'; '.join(bag.faults)})"
-        if not number:
-            raise InputError(f"{path.name} {fault}, and has no complete message; record it again")
-        words = (f"{path.name} {fault}: it is truncated or damaged, and only its {number} complete messages are read.",)
-    elif path.is_dir() and not bag.with_metadata:
-        words = (
-            f"{path.name} has no metadata.yaml, as if the recorder was killed: read from its {len(bag.files)} files.",
-        )
-    return topics, bag, words
+    try:
+        with rosbag.Reader(path) as reader:
+            connections = [each for each in reader.connections if not spans or each.msgtype in spans]
+            for each in connections:
+                definition = each.msgdef.data if each.msgdef.format.name == "MSG" else ""
+                topics[each.topic] = Topic(each.topic, each.msgtype, ros2, definition, spans.get(each.msgtype))
+            for connection, logged, data in reader.messages(connections) if connections else ():
+                topics[connection.topic].add(logged, data)
+    except rosbag.ReaderError as error:
+        raise InputError(
+            f"{path.name} cannot be read as a ROS bag ({error}); if its recorder was killed, repair it by `rosbag reindex`, "
+            "`ros2 bag reindex` or `mcap recover`"
+        ) from error
+    return topics
 
 
 # ----------------------------------------------------------------------------------------------------------- writing
@@ -268,13 +267,12 @@ def write_estimate(
     assert recording is not None
     series = _series(recording, estimate)
     others: list[Topic] = []
-    bag = None
     if source is not None:
-        topics, bag, _ = topics_of(source, {})
-        if bag.ros2 == (target.suffix.lower() != ".bag"):
-            written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
-            others = [t for t in topics.values() if t.kind != IMU and t.name not in written]
-    _write(target, series, others, bag)
+        ros2 = target.suffix.lower() != ".bag"
+        written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
+        topics = topics_of(source, {}).values()
+        others = [t for t in topics if t.ros2 == ros2 and t.kind != IMU and t.name not in written]
+    _write(target, series, others)
 
 
 _Series = tuple[str, NDArray[np.int64], Array]
@@ -344,7 +342,7 @@ def _encoded(stamps: NDArray[np.int64], numbers: Array, ros2: bool) -> NDArray[n
     return table
 
 
-def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), bag: Bag | None = None) -> None:
+def _write(target: Path, series: list[_Series], others: Sequence[Topic] = ()) -> None:
     """Write messages in the order of their times; the bag is created only when complete."""
     what = f"writing {target.name}"
     ros2 = target.suffix.lower() != ".bag"
@@ -359,36 +357,31 @@ def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), ba
             plugin = "MCAP" if target.suffix.lower() == ".mcap" else "SQLITE3"
             options = {"version": 9, "storage_plugin": rosbag.StoragePlugin[plugin]}
         with rosbag.Writer(place, **options) as writer:
-            queue: list[tuple[int, Any, Data]] = []
+            queue: list[tuple[int, Any, bytes]] = []
             for kind, stamps, numbers in series:
                 name = WITH_ORIENTATION if kind == IMU and np.any(numbers[:, 4] != -1.0) else TOPICS[kind]
                 connection = writer.add_connection(name, kind, typestore=store)
                 rows = _encoded(stamps, numbers, ros2)
                 queue += [(stamp, connection, row.tobytes()) for stamp, row in zip(stamps.tolist(), rows, strict=True)]
-            if bag is not None:
-                queue += _copied(writer, others, bag, store)
+            queue += _copied(writer, others, store)
             queue.sort(key=lambda message: message[0])
             for stamp, connection, data in queue:
                 writer.write(connection, stamp, data)
         written = place if not ros2 else next(item for item in place.iterdir() if item.suffix == target.suffix.lower())
-        if written.suffix == ".mcap":
-            write_checksums(written)
         if target.is_dir():
             raise InputError(f"{target} is a folder; choose another name")
         shutil.move(written, target)
 
 
-def _copied(writer: Any, topics: Sequence[Topic], bag: Bag, known: Any) -> list[tuple[int, Any, Data]]:
+def _copied(writer: Any, topics: Sequence[Topic], known: Any) -> list[tuple[int, Any, bytes]]:
     """Return the messages of topics that are copied unchanged, with the types of their bag, or else the library's own."""
     typesys = library("rosbags.typesys", "copying topics")
     store = typesys.get_typestore(typesys.Stores.EMPTY)
-    types = {
-        name: fields
-        for kind, text in bag.definitions.items()
-        for name, fields in typesys.get_types_from_msg(text, kind).items()
-    }
+    types: dict[str, Any] = {}
+    for topic in topics:
+        types |= typesys.get_types_from_msg(topic.definition, topic.kind) if topic.definition else {}
     store.register(types or known.fielddefs)
-    queue: list[tuple[int, Any, Data]] = []
+    queue: list[tuple[int, Any, bytes]] = []
     for topic in topics:
         connection = writer.add_connection(topic.name, topic.kind, typestore=store)
         queue += [(logged, connection, raw) for logged, raw in zip(topic.logged, topic.raw, strict=True)]
