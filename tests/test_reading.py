@@ -1,21 +1,17 @@
 """The one layer that every file passes: what it lets through, and what it refuses in time and by name."""
 
 import dataclasses
-import faulthandler
 import gc
 import json
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
 import tracemalloc
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -95,13 +91,39 @@ def _written(path) -> Path:
 # --------------------------------------------------------------------------------------------------------------------- sizes
 
 
-def spent(refused) -> tuple[float, float]:
-    """Seconds of the processor and megabytes that a refusal takes."""
+def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path):
+    path = tmp_path / "bomb.npy"
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (300_000_000, 3)})
+    with pytest.raises(InputError, match=r"bomb\.npy cannot be read \("):
+        recordings.read_samples(path, "gyro", rate=100.0, units=UNITS)
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+@pytest.mark.parametrize(
+    ("rows", "stored", "words"),
+    [
+        (300_000_000, 0, "increments declares 7200 MB, but the file has 0 MB of it"),
+        (12_000_000, 12_000_000, "has 0.* MB and unpacks to 288 MB"),
+    ],
+)
+def test_a_dataset_of_more_than_a_file_can_hold_is_refused_before_memory_is_taken(
+    tmp_path, sealed, rows, stored, words
+):
+    path = _written(tmp_path / "bomb.h5")
+    with changed(path) as file:
+        del file["increments"]
+        chunks = (1_000_000, 3)
+        bomb = file.create_dataset("increments", shape=(rows, 3), dtype="f8", chunks=chunks, compression="gzip")
+        for first in range(0, stored, chunks[0]):
+            bomb[first : first + chunks[0]] = 0.0
+    if not sealed:
+        _of_another_program(path)
     tracemalloc.start()
-    begun = time.process_time()
     try:
-        refused()
-        return time.process_time() - begun, tracemalloc.get_traced_memory()[1] / 1e6
+        with pytest.raises(InputError, match=rf"bomb\.h5.* {words}"), reading.hdf5(path):
+            pass
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()
 
@@ -117,81 +139,9 @@ def processor_seconds(read) -> float:
         gc.enable()
 
 
-def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path):
-    path = tmp_path / "bomb.npy"
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (300_000_000, 3)})
-
-    def refused():
-        with pytest.raises(
-            InputError,
-            match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, but 0 follow",
-        ):
-            recordings.read_samples(path, "gyro", rate=100.0, units=UNITS)
-
-    seconds, megabytes = spent(refused)
-    assert seconds < 1.0
-    assert megabytes < 10.0
-
-
-@pytest.mark.parametrize("sealed", [True, False])
-def test_a_dataset_that_declares_more_than_the_file_holds_is_refused(tmp_path, sealed):
-    path = _written(tmp_path / "bomb.h5")
-    with changed(path) as file:
-        del file["increments"]
-        file.create_dataset("increments", shape=(300_000_000, 3), dtype="f8", chunks=True)
-    if not sealed:
-        _of_another_program(path)
-
-    def refused():
-        words = r"bomb\.h5: increments declares 7200 MB, but the file has 0 MB of it"
-        with pytest.raises(InputError, match=words), reading.hdf5(path):
-            pass
-
-    seconds, megabytes = spent(refused)
-    assert seconds < (1.0 if sealed else 5.0)
-    assert megabytes < 10.0
-
-
-def test_the_limit_is_on_what_is_unpacked_and_a_user_can_raise_it(tmp_path, monkeypatch):
-    path = tmp_path / "zeros.h5"
-    recordfiles.write_record(path, ImuRecord(time=np.arange(60_001.0), increments=np.zeros((60_000, 3))))
-    assert path.stat().st_size < 200_000
-    monkeypatch.setenv("STRAPDOWN_MAX_MB", "1")
-    with pytest.raises(
-        InputError, match=r"zeros\.h5 has 1\.92 MB, more than the maximum of 1 MB.*STRAPDOWN_MAX_MB \(1 now\)"
-    ):
-        recordfiles.read_record(path)
-    (tmp_path / "full").write_bytes(bytes(1_000_000))
-    assert len(reading.content(tmp_path / "full")) == 1_000_000
-    monkeypatch.setenv("STRAPDOWN_MAX_MB", "2")
-    assert len(recordfiles.read_record(path).increments) == 60_000
-    monkeypatch.setenv("STRAPDOWN_MAX_MB", "much")
-    with pytest.raises(InputError, match="STRAPDOWN_MAX_MB is 'much'; it must be a whole number"):
-        recordfiles.read_record(path)
-
-
-@pytest.mark.parametrize("name", ["walk.csv", "scenario.toml", "tuning.json", "gyro.npy"])
-def test_a_large_file_is_refused_before_it_is_read(known, tmp_path, name):
-    path = tmp_path / name
-    with path.open("wb") as file:
-        file.truncate(5_000_000_000)  # of holes, which take no place on the disk
-
-    def refused():
-        with pytest.raises(InputError, match=rf"{name} has 5000 MB, more than"):
-            known[name].read(path)
-
-    seconds, megabytes = spent(refused)
-    assert seconds < 1.0
-    assert megabytes < 10.0
-
-
 @pytest.mark.parametrize(
     ("name", "begin", "unit", "end"),
     [
-        ("scenario.toml", "", "a.", "a = 1\n"),
-        ("scenario.toml", "", '"a b" . ', "a = 1\n"),
-        ("scenario.toml", "[", "a.", "a]\n"),
         ("scenario.toml", "a = ", "[", "\n"),
         ("scenario.toml", "a = ", "{a = ", "\n"),
         ("scenario.toml", "", "a", "\n"),
@@ -261,8 +211,8 @@ def _external_storage(file):
 @pytest.mark.parametrize(
     ("refer", "words"),
     [
-        (_external, "truth/bias is an external link, which is not followed"),
-        (_soft, "truth/bias is a soft link, which is not followed"),
+        (_external, "truth/bias is a link, which is not followed"),
+        (_soft, "truth/bias is a link, which is not followed"),
         (_virtual, "truth/bias is stored in other files, which are not read"),
         (_external_storage, "truth/bias is stored in other files, which are not read"),
     ],
@@ -377,99 +327,7 @@ def test_a_file_changed_on_purpose_gets_a_new_digest(tmp_path):
         files.seal(path)
 
 
-def test_a_file_whose_heap_of_texts_is_damaged_is_refused_and_does_not_hang(tmp_path, monkeypatch):
-    """The HDF5 library loops for ever, deaf to Ctrl-C, where a sector of this heap is zero."""
-    path = _written(tmp_path / "record.h5")
-    _of_another_program(path)
-    content = path.read_bytes()
-    heap = content.index(b"GCOL")
-    path.write_bytes(content[: heap + 16] + bytes(512) + content[heap + 528 :])
-    fork = reading._status_of_fork
-    monkeypatch.setattr(reading, "_status_of_fork", lambda path, seconds: fork(path, 1))
-    begun = time.monotonic()
-    with pytest.raises(InputError, match=r"record\.h5 is damaged: the HDF5 library does not come to an end"):
-        recordfiles.read_record(path)
-    assert time.monotonic() - begun < 30.0  # one of the processor, instead of two
-
-
-def test_what_is_no_hdf5_at_all_costs_no_child(tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "_fault_of_child", None)
-    (tmp_path / "text.h5").write_text("time,gx\n")
-    with pytest.raises(InputError, match=r"text\.h5 cannot be read as HDF5 \(it has no signature\)"):
-        recordfiles.read_record(tmp_path / "text.h5")
-
-
-def _aborts(*_):
-    faulthandler.disable()  # which pytest has write to the terminal
-    os.abort()
-
-
-def _is_killed(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
-@pytest.mark.parametrize(
-    ("end", "words"),
-    [
-        (_aborts, r"unit\.h5 is damaged: the HDF5 library crashes on it; restore a copy, or make it again"),
-        (_is_killed, r"unit\.h5 is damaged: the HDF5 library does not come to an end"),
-    ],
-    ids=["crash", "limit"],
-)
-def test_a_crash_of_the_library_is_that_of_a_fork_and_reported_as_damage(tmp_path, monkeypatch, end, words):
-    with h5py.File(tmp_path / "unit.h5", "w") as file:
-        file["values"] = np.zeros(3)
-    monkeypatch.setattr(reading, "threading", SimpleNamespace(active_count=lambda: 1))  # pytest-xdist has one more
-    monkeypatch.setattr(reading, "_status_of_process", None)
-    monkeypatch.setattr(reading, "probe", end)
-    with pytest.raises(InputError, match=words), reading.hdf5(tmp_path / "unit.h5"):
-        pass
-
-
-@pytest.mark.parametrize("status", [0, -6])
-def test_beside_another_thread_a_new_process_tries_it(tmp_path, monkeypatch, status):
-    """A fork would hold for ever the locks that other threads have just then."""
-    path = tmp_path / "unit.h5"
-    with h5py.File(path, "w") as file:
-        file["values"] = np.zeros(3)
-    real, tried = reading._status_of_process, []
-    monkeypatch.setattr(reading, "_status_of_fork", None)
-    monkeypatch.setattr(
-        reading, "_status_of_process", lambda *arguments: tried.append(arguments[0]) or status or real(*arguments)
-    )
-    done = threading.Event()
-    other = threading.Thread(target=done.wait)
-    other.start()
-    try:
-        if status:
-            with pytest.raises(InputError, match="the HDF5 library crashes on it"), reading.hdf5(path):
-                pass
-        else:
-            with reading.hdf5(path) as file:
-                assert file["values"].shape == (3,)
-    finally:
-        done.set()
-        other.join()
-    assert tried == [str(path)]
-
-
 # ----------------------------------------------------------------------------------------------------- no fault of the file
-
-
-def test_a_missing_library_is_no_damage_of_the_file(known, tmp_path, monkeypatch):
-    path = tmp_path / "scenario.toml"
-    path.write_bytes(known["scenario.toml"].content)
-
-    def lacking(*_):
-        raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
-
-    monkeypatch.setattr("strapdown.scenarios.toml._from_table", lacking)
-    words = r"scenario\.toml is not read: .* \(No module named 'scipy'\); install strapdown again with pip"
-    with pytest.raises(InputError, match=words) as caught:
-        scenarios.load_scenario(path)
-    assert "damaged" not in str(caught.value)
-    assert isinstance(caught.value.__cause__, ModuleNotFoundError)
 
 
 # ----------------------------------------------------------------------------------------------------- wrong types, raw counts

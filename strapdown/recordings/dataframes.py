@@ -143,7 +143,7 @@ def read_parquet(
         schema, rows = content.schema_arrow, content.metadata.num_rows
         # Numbers, flags and dates; other columns, which may have any size, are not read.
         flat = [k for k, column in enumerate(schema) if types.is_primitive(column.type) or types.is_null(column.type)]
-        reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
+        reading.need_room(file, 8.0 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
     return from_table(_of_arrow(table), source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
 

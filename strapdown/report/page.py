@@ -140,9 +140,6 @@ def _image(kind: str, content: bytes, caption: str, *, wide: bool) -> str:
     )
 
 
-LARGEST_FIGURE = 50_000_000
-"""Maximum size of a figure that is included in the page, bytes."""
-
 _KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
 """Media type and first bytes of the image formats that a page can show."""
 
@@ -155,7 +152,7 @@ def stored_figure(stem: Path, caption: str) -> str:
     for suffix, (kind, first) in _KINDS.items():
         path = stem.with_name(f"{stem.name}.{suffix}")
         if path.exists():
-            content = reading.content(path, link=False, maximum=LARGEST_FIGURE)
+            content = reading.content(path, link=False)
             if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
             return section(caption, _image(kind, content, caption, wide=True))

@@ -81,7 +81,7 @@ def targets(folder: Path) -> list[Target]:
         target("record.h5", recordfiles.read_record, structure, 0.015),
         target("estimate.h5", setup.read_estimate, structure, 0.015),
         target("campaign.h5", campaign.read, structure, 0.015),
-        target("broad.hdf5", recordings.read, (*bytewise, damage.change_hdf5), 0.001),
+        target("broad.hdf5", recordings.read, structure, 0.001),
         target("walk.csv", recordings.read, damage.TEXT, 0.22),
         target("gyro.npy", lambda path: recordings.read_samples(path, rate=100.0, units=units), (*bytewise, damage.replace_word), 0.08),
         target("scenario.toml", scenarios.load_scenario, damage.TEXT, 0.04),
