@@ -5,7 +5,6 @@ import dataclasses
 import os
 import resource
 import signal
-import struct
 import threading
 import time
 
@@ -18,7 +17,7 @@ from ulog_writer import write_ulog
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.recordings import attitudes, trajectories, ulog
+from strapdown.recordings import attitudes, trajectories
 
 SECONDS = 8.0
 MEGABYTES = 1000.0
@@ -40,44 +39,6 @@ def refused(path, words, read=recordings.read):
 
 
 # ---------------------------------------------------------------------------------------------------------------------- ULog
-
-ULOG = b"ULog\x01\x12\x35\x01" + bytes(8)
-
-
-def block(kind: bytes, content: bytes) -> bytes:
-    return struct.pack("<HB", len(content), kind[0]) + content
-
-
-def test_a_log_on_which_the_library_goes_back_for_ever_is_refused_with_the_place(tmp_path, monkeypatch):
-    monkeypatch.setattr(ulog, "SECONDS", 2.0 * SECONDS)  # not because of the time
-    path = tmp_path / "endless.ulg"
-    path.write_bytes(ULOG + bytes(20_000) + struct.pack("<HB", 15_000, 214) + bytes(100))
-    refused(path, r"endless\.ulg cannot be read as ULog \(the library does not come to an end at byte 20119\)")
-    refused(path, "does not come to an end", attitudes.read_attitudes)
-
-
-@pytest.mark.parametrize(
-    "formats",
-    [
-        [b"a:float[60000] x;", b"b:a[60000] y;", b"sensor_combined:b[60000] z;"],
-        [b"sensor_combined:sensor_combined[2] again;"],
-        [b"a:b x;", b"b:a x;", b"sensor_combined:a x;"],
-    ],
-)
-def test_a_log_of_messages_with_too_many_fields_is_refused(tmp_path, formats):
-    path = tmp_path / "fields.ulg"
-    subscription = block(b"A", b"\0\0\0sensor_combined")
-    path.write_bytes(ULOG + b"".join(block(b"F", declaration) for declaration in formats) + subscription)
-    refused(path, r"fields\.ulg cannot be read: its message \w+ has more than 65535 fields")
-
-
-def test_many_subscriptions_of_large_messages_come_to_an_end(tmp_path, monkeypatch):
-    monkeypatch.setattr(ulog, "SECONDS", 0.1)
-    path = tmp_path / "subscriptions.ulg"
-    path.write_bytes(
-        ULOG + block(b"F", b"sensor_combined:float[60000] x;") + 2000 * block(b"A", b"\0\0\0sensor_combined")
-    )
-    refused(path, r"does not come to an end at byte \d+")
 
 
 def test_a_log_with_a_changed_name_of_a_field_is_refused_by_the_field(tmp_path):

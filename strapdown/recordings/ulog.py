@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.files import reading
 from strapdown.files.extras import library
 from strapdown.records import outputs
 from strapdown.records.recording import Recording, beside, interpolated, relative_time, with_gyro
@@ -33,10 +30,6 @@ TRUTH = "vehicle_attitude_groundtruth"
 """Attitude of a simulator, which is the reference if there is one."""
 NO_SAMPLE = 0x7FFFFFFF
 """``accelerometer_timestamp_relative`` if there is no new sample."""
-HEADER, TAIL = 16, 1 << 17
-"""Number of bytes before the first message, and at the end that are checked for truncation: twice the longest message."""
-KINDS = b"ABCDFILMOPQRST"
-"""Letters of the messages."""
 LATE = 0.5
 """Minimum time offset of the accelerometer, in sample intervals, that is reported."""
 
@@ -54,8 +47,6 @@ def read_ulog(file: Path, *, topic: str) -> Recording:
     topic_name = one_of(f"{file.name}: topic", topic or units[0], units)
     stamps, order, remarks = in_order(topic_name, data[topic_name]["timestamp"])
     remarks = [f"Topic {topic_name}: {len(stamps)} messages.", *remarks]
-    if _is_cut(file):
-        remarks.append(f"{file.name} is truncated: only complete messages are read.")
     if log.file_corruption:
         remarks.append(f"{file.name} is damaged: only complete messages are read.")
     if log.dropouts:
@@ -98,82 +89,11 @@ def _reference(topic: str, rows: dict[str, Any], time: Array, epoch: int) -> tup
     return attitude, [f"Reference: {topic}, {whose}.", *words]
 
 
-SECONDS, SECONDS_PER_MB = 2.0, 2.0
-"""Maximum time of the processor that the library may take for a log, more than ten times the usual."""
-LONGEST = 65535
-"""Maximum number of fields of a message, whose length is a number of 16 bits."""
-
-
-class _Content(io.BytesIO):
-    """The content of a log whose reading ends: within a limit of time, and never going back to before a message that was just read."""
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__(content)
-        self._until = time.thread_time() + SECONDS + SECONDS_PER_MB * len(content) / 1e6
-        self._header = self._body = 0  # bytes that the last two calls of read returned
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if time.thread_time() > self._until:
-            raise self._too_long()
-        content = super().read(size)
-        self._header, self._body = self._body, len(content)
-        return content
-
-    def seek(self, offset: int, whence: int = 0, /) -> int:
-        # After a damaged message the library goes back by the size that the message declares. Where the log ends before that, it would
-        # go back further than it came, for ever.
-        if whence == 1 and -offset > self._header + self._body:
-            raise self._too_long()
-        return super().seek(offset, whence)
-
-    def _too_long(self) -> _TooLongError:
-        return _TooLongError(f"the library does not come to an end at byte {self.tell()}")
-
-
-class _TooLongError(Exception):
-    """The library does not come to an end; it handles all usual exceptions as damage."""
-
-
 def opened(file: Path, topics: list[str]) -> Any:
     """Return a flight log with these topics, read by the library."""
     pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
-    content = reading.content(file)
     with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
-        definitions = pyulog.ULog(_Content(content), parse_header_only=True).message_formats
-        for name in definitions:
-            _need_fields(file, name, definitions, {})
-        return pyulog.ULog(_Content(content), topics)
-
-
-def _need_fields(file: Path, name: str, definitions: Mapping[str, Any], known: dict[str, int]) -> int:
-    """Return the number of fields of a message with its nested messages, which the library enumerates; reject too many."""
-    if name not in known:
-        known[name] = LONGEST + 1  # while it is counted: for one that contains itself
-        known[name] = sum(
-            max(1, size) * (_need_fields(file, kind, definitions, known) if kind in definitions else 1)
-            for kind, size, _ in definitions[name].fields
-        )
-    if known[name] > LONGEST:
-        raise InputError(
-            f"{file.name} cannot be read: its message {name} has more than {LONGEST} fields, as if damaged"
-        )
-    return known[name]
-
-
-def _is_cut(file: Path) -> bool:
-    """Return whether a log ends within a message: followed from the first message, or in a long log from any eight consecutive ones."""
-    with reading.opened(file) as stream:
-        begin = max(HEADER, stream.seek(0, io.SEEK_END) - TAIL)
-        stream.seek(begin)
-        data = stream.read()
-    for first in range(1 if begin == HEADER else len(data)):
-        place, number = first, 0
-        while place + 3 <= len(data) and data[place + 2] in KINDS:
-            place += 3 + int.from_bytes(data[place : place + 2], "little")
-            number += 1
-        if place + 3 > len(data) and (number >= 8 or begin == HEADER):
-            return place != len(data)
-    return False
+        return pyulog.ULog(str(file), topics)
 
 
 def columns(rows: dict[str, Any], name: str, size: int) -> Array:

@@ -80,7 +80,7 @@ class Recording(Listed):
         Stamps of rows that repeat the stamp of the row before, s; they are left out. If their share is above :data:`FEW_REPEATED` and
         their samples differ, the file is rejected.
     remarks : tuple of str, default empty
-        Choices and omissions of the reader, one sentence each: columns guessed, topics used, the part of a truncated file.
+        Choices and omissions of the reader, one sentence each: columns guessed, topics used.
     """
 
     source: str
