@@ -162,9 +162,9 @@ def write_recording(recording: Recording, path: Path) -> None:
     _write(path, *_columns_of(recording))
 
 
-def write_estimate(estimate: Estimate, path: Path, *, recording: Recording | None, **options: Any) -> None:
+def write_estimate(estimate: Estimate, path: Path, **options: Any) -> None:
     """Write an estimate as Parquet or text, by the extension; options as for :meth:`strapdown.records.Estimate.table`."""
-    _write(path, estimate.table(recording=recording, **options), {})
+    _write(path, estimate.table(**options), {})
 
 
 def _write(path: Path, columns: Mapping[str, NDArray[np.generic]], units: Mapping[str, str]) -> None:

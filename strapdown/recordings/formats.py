@@ -38,7 +38,7 @@ class Format:
     write: Any = None
     """Function that writes a recording, from it and a path; None: cannot be written."""
     write_estimate: Any = None
-    """Function that writes an estimate, likewise, with the keyword ``recording`` and ``estimate_options``."""
+    """Function that writes an estimate, likewise, with ``estimate_options``, and with the keyword ``recording`` if ``with_samples``."""
     options: tuple[str, ...] = ()
     """Keywords of :func:`read` that the reader accepts."""
     estimate_options: tuple[str, ...] = ()
@@ -206,14 +206,16 @@ def write(
 ) -> None:
     """Write a recording or an estimate in the format of the file extension; the file is created only when complete.
 
-    A simulated record is written as the recording of a device. ``recording`` is that from which an estimate was made, whose samples are
-    written if the format supports them (a ROS bag needs it); ``options`` are those of the format's writer.
+    A simulated record is written as the recording of a device. ``recording``, from which an estimate was made, is needed by a ROS bag;
+    ``options`` are those of the format's writer.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content)
     if isinstance(content, Estimate):
         file_format = estimate_format(path, options, recording=recording is not None)
-        file_format.write_estimate(content, Path(path), recording=recording, **options)
+        if file_format.with_samples:
+            options["recording"] = recording
+        file_format.write_estimate(content, Path(path), **options)
     else:
         _by_ending(path, "write").write(content, Path(path), **options)
 

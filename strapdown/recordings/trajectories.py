@@ -126,11 +126,11 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
     return replace(recording, true_attitude=reference, remarks=(*recording.remarks, words))
 
 
-def write_tum(estimate: Estimate, path: Path, *, recording: Recording | None, frame: str = "ENU") -> None:
+def write_tum(estimate: Estimate, path: Path, *, frame: str = "ENU") -> None:
     """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
     table = estimate.table(frame=frame)
     q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
-    stamps = whole_ns(estimate.time) + estimate.epoch_ns(recording)
+    stamps = whole_ns(estimate.time) + estimate.epoch_ns
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write("# time tx ty tz qx qy qz qw\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):

@@ -25,7 +25,7 @@ from strapdown.checks import (
 from strapdown.files.extras import library
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
-from strapdown.records.recording import Recording, whole_ns
+from strapdown.records.recording import whole_ns
 from strapdown.results import ByValue, Column, Listed, Table, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_name, error_state_unit
 
@@ -428,11 +428,6 @@ class Estimate(ByValue, Listed):
         return np.asarray(self.variance[:, :3, None] * np.eye(3))
 
     @property
-    def matrix(self) -> Array:
-        """Rotation matrices R_fb (m, 3, 3)."""
-        return quaternion.to_matrix(self.attitude)
-
-    @property
     def rotation(self) -> Rotation:
         """Attitudes as a ``scipy.spatial.transform.Rotation`` that transforms body vectors to the fixed frame."""
         return quaternion.to_rotation(self.attitude)
@@ -452,65 +447,34 @@ class Estimate(ByValue, Listed):
         """
         return outputs.euler(self.attitude, sequence, self.attitude_covariance)
 
-    def heading(self, axis: str = "x") -> outputs.Angles:
-        """Return the heading of a body axis, as :func:`strapdown.records.outputs.heading`.
+    @property
+    def epoch_ns(self) -> int:
+        """Reading of the recording's clock at time 0, ns since 1970; 0: unknown."""
+        return 0 if self.origin is None else self.origin.epoch_ns
 
-        Parameters
-        ----------
-        axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
-            Body axis that points forward.
-
-        Returns
-        -------
-        Angles
-            Heading (m,) from North towards East and its σ, rad.
-        """
-        return outputs.heading(self.attitude, self.attitude_covariance, axis=axis)
-
-    def epoch_ns(self, recording: Recording | None = None) -> int:
-        """Return the reading of the recording's clock at time 0.
-
-        Parameters
-        ----------
-        recording : Recording, optional
-            Recording that the estimate was made from. Default: as the origin says.
-
-        Returns
-        -------
-        int
-            ns since 1970; 0: unknown.
-        """
-        return (recording or self.origin or Origin()).epoch_ns
-
-    def table(
-        self, *, recording: Recording | None = None, sequence: str = "ZYX", frame: str = "ENU"
-    ) -> dict[str, NDArray[np.generic]]:
+    def table(self, *, sequence: str = "ZYX", frame: str = "ENU") -> dict[str, NDArray[np.generic]]:
         """Return the estimate as columns, with the unit in each name.
 
         Parameters
         ----------
-        recording : Recording, optional
-            Recording that the estimate was made from: adds its clock, its rate without the bias, and its acceleration without gravity.
         sequence : str, default "ZYX"
             Sequence of the Euler angles, as in :meth:`euler`.
         frame : {"ENU", "NED"}, default "ENU"
-            Fixed frame of quaternion, angles and acceleration; body axes are unchanged.
+            Fixed frame of quaternion and angles; body axes are unchanged.
 
         Returns
         -------
         dict of str to ndarray (m,)
             ``time_s`` (or ``time_ns`` for a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
-            ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
-            ``free_acceleration_*_m_per_s2``. If full covariances were stored, ``cov_body_xx_rad2`` … of the body-side error,
-            with ``b`` before an axis for the bias.
+            ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h. If full covariances were stored,
+            ``cov_body_xx_rad2`` … of the body-side error, with ``b`` before an axis for the bias.
         """
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance
         q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
         columns: dict[str, NDArray[np.generic]] = {"time_s": self.time}
-        epoch = self.epoch_ns(recording)
-        if epoch:
-            columns = {"time_ns": whole_ns(self.time) + epoch}
+        if self.epoch_ns:
+            columns = {"time_ns": whole_ns(self.time) + self.epoch_ns}
         columns |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         axes = sequence.upper()
@@ -532,14 +496,6 @@ class Estimate(ByValue, Listed):
             for i, j in itertools.combinations_with_replacement(range(size), 2):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
                 columns[f"cov_body_{STATES[i]}{STATES[j]}_{unit}"] = self.covariance[:, i, j]
-        if recording is not None:
-            rows = recording.rows_of(self.time)
-            rate = recording.rate[rows] - (self.bias if self.has_bias else 0.0)
-            columns |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
-            if recording.specific_force is not None:
-                free = outputs.free_acceleration(self.attitude, recording.specific_force[rows])
-                free = free if frame == "ENU" else free[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-                columns |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
         return columns
 
     def to_dataframe(self, **options: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Attitudes in other quantities: Euler angles with σ, heading from North, North-East-Down, and free acceleration.
+"""Attitudes in other quantities: Euler angles with σ, heading from North, and North-East-Down.
 
 The fixed frame of an estimate is East-North-Up (without a magnetometer z up with an arbitrary heading), and ``q_fb`` transforms body
 vectors to it. For rotation matrices and SciPy rotations see :func:`strapdown.quaternion.to_matrix` and
@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
+from strapdown.checks import Array, InputError, array, unit_quaternions
 from strapdown.kinematics import skew
-from strapdown.units import STANDARD_GRAVITY
 
 __all__ = ["Angles", "euler", "heading"]
 
@@ -114,8 +113,8 @@ def _turn_axes(angles: Array, sequence: str) -> Array:
     return E
 
 
-def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: str = "x") -> Angles:
-    """Return the heading of a body axis, its angle from North towards East, and its standard deviation.
+def heading(attitude: ArrayLike, covariance: ArrayLike | None = None) -> Angles:
+    """Return the heading of the body x axis, its angle from North towards East, and its standard deviation.
 
     Parameters
     ----------
@@ -123,8 +122,6 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
         Unit quaternions q_fb, fixed frame East-North-Up. North is that of the estimate: magnetic, or arbitrary without a magnetometer.
     covariance : array_like (n, 3, 3), optional
         Covariance of the body-side attitude error, rad².
-    axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
-        Body axis that points forward.
 
     Returns
     -------
@@ -137,15 +134,13 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
     [1.570796]
     """
     q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
-    one_of("axis", axis, ("x", "y", "z", "-x", "-y", "-z"))
-    forward = np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0)
     R = quaternion.to_matrix(q)
-    v = R @ forward
+    v = R[:, :, 0]
     angle = np.mod(np.arctan2(v[:, 0], v[:, 1]), 2.0 * np.pi)
     if covariance is None:
         return Angles(angle, None)
     P = array("covariance", covariance, (len(q), 3, 3))
-    change = -R @ skew(forward)  # d(R f)/dδθ
+    change = -R @ skew(np.eye(3)[0])  # d(R x)/dδθ
     level = v[:, 0] ** 2 + v[:, 1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         row = (v[:, 1, None] * change[:, 0] - v[:, 0, None] * change[:, 1]) / level[:, None]
@@ -156,9 +151,3 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
 def to_ned(attitude: ArrayLike) -> Array:
     """Return attitudes q_fb (n, 4) with the fixed frame changed from East-North-Up to North-East-Down, or back."""
     return quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
-
-
-def free_acceleration(attitude: Array, specific_force: Array) -> Array:
-    """Return the acceleration without gravity (n, 3), ``R f − g up``, m/s², fixed axes; ``specific_force`` (n, 3) may be NaN."""
-    felt = np.einsum("nij,nj->ni", quaternion.to_matrix(attitude), specific_force)
-    return np.asarray(felt - np.array([0.0, 0.0, STANDARD_GRAVITY]))
