@@ -507,7 +507,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recordin
     wrong = tmp_path / "hand.csv"
     wrong.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
     said = succeeds("estimate", wrong, "--out", tmp_path / "out")
-    words = "warning: hand.csv: probably gyro rates are 57.3 times too small (rad/s read as deg/s; --gyro-unit rad/s); specific force is "
+    words = "warning: hand.csv: probably gyro in rad/s (--gyro-unit rad/s); accelerometer in m/s2 (--accelerometer-unit m/s2)"
     assert words in said
     # Which then ends for want of the parameter.
     assert words in run("tune", wrong, "--free", "nothing", "--out", tmp_path / "filter.toml")[1]

@@ -40,13 +40,14 @@ from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = ["Examination", "examine"]
 
-AXES: tuple[Array, ...] = tuple(
-    np.array([[s if column == where else 0.0 for column in range(3)] for where, s in zip(order, signs, strict=True)])
-    for order in itertools.permutations(range(3))
-    for signs in itertools.product((1.0, -1.0), repeat=3)
+AXES: Array = np.array(
+    [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
 )
-"""All 48 permutations and inversions of the axes, the identity first."""
-_ALL = np.stack(AXES)
+"""All 48 permutations and inversions of the axes (48, 3, 3), the identity first."""
 
 ATTITUDE_READINGS: dict[str, Callable[[Array], Array]] = {
     "conjugated (fixed to body)": quaternion.conjugate,
@@ -67,34 +68,33 @@ class Change(NamedTuple):
     """A change of the declared conventions."""
 
     words: str
-    """With the hint to its remedy."""
-    brief: str
-    """In few words, for a row of a table."""
+    hint: str = ""
+    """Argument that makes it."""
+
+    def __str__(self) -> str:
+        return f"{self.words} ({self.hint})" if self.hint else self.words
 
 
-SHORT = {"accelerometer": "acc", "magnetometer": "mag", "gyro": "gyro", "whole unit": "whole unit"}
-"""Names in few words."""
+def _unit(sensor: str, unit: str) -> Change:
+    return Change(f"{sensor} in {unit}", str(Hint("units", {sensor: unit})))
 
 
-def _unit(fault: str, taken: str, sensor: str, unit: str) -> Change:
-    """Return the change of a wrong unit."""
-    return Change(f"{fault} ({taken}; {Hint('units', {sensor: unit})})", f"{SHORT[sensor]} in {unit}")
-
-
-AS_DECLARED = Change("", "")
+AS_DECLARED = Change("")
 GYRO_UNITS: dict[Change, float] = {
     AS_DECLARED: 1.0,
-    _unit("gyro rates are 57.3 times too large", "deg/s read as rad/s", "gyro", "deg/s"): math.pi / 180.0,
-    _unit("gyro rates are 57.3 times too small", "rad/s read as deg/s", "gyro", "rad/s"): 180.0 / math.pi,
-    _unit("gyro rates are 1000 times too large", "mrad/s read as rad/s, or mdeg/s as deg/s", "gyro", "mrad/s"): 1e-3,
+    _unit("gyro", "deg/s"): DEGREE,
+    _unit("gyro", "rad/s"): 1.0 / DEGREE,
+    _unit("gyro", "mrad/s"): 1e-3,
 }
+"""Factors of the rates if they were read in a wrong unit: deg/s read as rad/s, rad/s as deg/s, mrad/s as rad/s."""
 FORCE_UNITS: dict[Change, float] = {
     AS_DECLARED: 1.0,
-    _unit("specific force is 9.81 times too small", "g read as m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
-    _unit("specific force is 9.81 times too large", "m/s² read as g", "accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
-    _unit("specific force is 102 times too large", "mg read as m/s²", "accelerometer", "mg"): 1e-3 * STANDARD_GRAVITY,
-    _unit("specific force is 1000 times too large", "mm/s² read as m/s², or mg as g", "accelerometer", "mm/s2"): 1e-3,
+    _unit("accelerometer", "g"): STANDARD_GRAVITY,
+    _unit("accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
+    _unit("accelerometer", "mg"): 1e-3 * STANDARD_GRAVITY,
+    _unit("accelerometer", "mm/s2"): 1e-3,
 }
+"""The same of the specific force: g, mg or mm/s² read as m/s², m/s² read as g."""
 
 NO_CHANGE = "no change"
 PENALTY = 5.0
@@ -130,8 +130,6 @@ class Candidate:
     ----------
     changes : tuple of str
         Changes of the declared conventions; empty: none.
-    brief : tuple of str
-        The same in few words.
     score : float
         Log-likelihood less the penalty for changes.
     misfit : mapping of str to float
@@ -139,7 +137,6 @@ class Candidate:
     """
 
     changes: tuple[str, ...]
-    brief: tuple[str, ...]
     score: float
     misfit: Mapping[str, float]
 
@@ -184,10 +181,17 @@ class Examination:
     def listing(self) -> Table:
         """Return the best explanations as a table; the hints to their remedies are in the verdict."""
         columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
-        relations = ("–".join(SHORT[sensor] for sensor in name.split(" and ")) for name in self.candidates[0].misfit)
-        columns += [Column(relation, shown="{:.3f}".format) for relation in relations]
-        brief = lambda changes: "; ".join(changes[:2]) + "; …" * (len(changes) > 2) or NO_CHANGE  # noqa: E731
-        rows = [(brief(best.brief), best.score, *best.misfit.values()) for best in self.candidates[:8]]
+        for name in self.candidates[0].misfit:  # "gyro and accelerometer": gyro–acc
+            relation = name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+            columns.append(Column(relation, shown="{:.3f}".format))
+        rows = [
+            (
+                "; ".join(best.changes[:2]) + "; …" * (len(best.changes) > 2) or NO_CHANGE,
+                best.score,
+                *best.misfit.values(),
+            )
+            for best in self.candidates[:8]
+        ]
         title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
         return Table(title, columns, rows)
 
@@ -244,7 +248,7 @@ def examine(recording: Recording) -> Examination:
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
     stuck = stuck_words(recording)
     doubts += _too_fast(recording) + stuck
-    unsaid = [f"as it seems, {change.words}" for change in unit_changes]  # gravity alone shows it, whatever the turns
+    unsaid = [f"as it seems, {change}" for change in unit_changes]  # gravity alone shows it, whatever the turns
     upright = at_rest(recording)
     explained = _without_reference if recording.true_attitude is None else _with_reference
     explanations = explained(recording, sensors, step)
@@ -286,13 +290,12 @@ def _concluded(source: str, tried: _Explanations, sure: tuple[Change, ...], note
     best = [
         Candidate(
             changes=tuple(change.words for change in (*tried.changes(k), *sure)),
-            brief=tuple(change.brief for change in (*tried.changes(k), *sure)),
             score=float(score[k]),
             misfit={name: float(values[k]) for name, values in tried.misfit.items()},
         )
         for k in order[:12]
     ]
-    words = lambda k: "; ".join(change.words for change in (*tried.changes(k), *sure)) or NO_CHANGE  # noqa: E731
+    words = lambda k: "; ".join(map(str, (*tried.changes(k), *sure))) or NO_CHANGE  # noqa: E731
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best[0].misfit.values()) > POOR:
         verdict = "cannot tell"
@@ -519,7 +522,7 @@ class _Windows(NamedTuple):
 
 def _turned(means: Array) -> Array:
     """Return the mean of R A v over each window (..., 48, windows, 3) for all axes A, from the means of R_ab v_c (..., windows, 3, 9)."""
-    return np.moveaxis(means @ _ALL.reshape(-1, 9).T, -1, -3)
+    return np.moveaxis(means @ AXES.reshape(-1, 9).T, -1, -3)
 
 
 def _windows(recording: Recording, sensors: _Sensors, step: int, known: np.ndarray | bool = True) -> _Windows | None:
@@ -615,7 +618,7 @@ def _gyro_fits(turn: Array, reference: Array) -> Array:
     cross = np.swapaxes(reference, -1, -2) @ turn
     own, other = np.sum(turn**2), np.sum(reference**2, axis=(1, 2))
     factor = np.array(list(GYRO_UNITS.values()))
-    along = cross.reshape(-1, 9) @ _ALL.reshape(-1, 9).T
+    along = cross.reshape(-1, 9) @ AXES.reshape(-1, 9).T
     misfit = 1.0 - 2.0 * factor * along[..., None] / (factor**2 * own + other[:, None, None])
     return np.asarray(misfit.reshape(len(reference), -1))
 
@@ -638,8 +641,8 @@ def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanation
     ``parts``: misfits of each sensor by reading and frame of the reference, and by setting of the sensor; ``floors``: m₀ of each.
     """
     commons = [
-        (Change(f"reference quaternions are {reading}", f"reference {reading}"),) * (reading != "")
-        + (Change(f"the reference's fixed frame is {frame}", f"reference {frame}"),) * (frame != "East-North-Up")
+        (Change(f"reference {reading}"),) * (reading != "")
+        + (Change(f"reference in {frame}"),) * (frame != "East-North-Up")
         for reading in ("", *ATTITUDE_READINGS)
         for frame in FRAMES
     ]
@@ -682,12 +685,10 @@ def _settings(name: str) -> tuple[tuple[Change, ...], ...]:
 @functools.cache
 def _axes_change(name: str, k: int) -> Change:
     if np.array_equal(AXES[k], -np.eye(3)):
-        remedy = f" ({Hint('invert', name)})" if name != "whole unit" else ""
-        return Change(f"axes of the {name} are inverted{remedy}", f"{SHORT[name]} inverted")
+        return Change(f"{name} inverted", "" if name == "whole unit" else str(Hint("invert", name)))
     words = axes_words(AXES[k])
     option = words.replace("−", "-").replace(" ", "")
-    hint = Hint("axes", option if name == "whole unit" else {name: option})
-    return Change(f"axes of the {name} should be read as ({words}) ({hint})", f"{SHORT[name]} ({words})")
+    return Change(f"{name} axes ({words})", str(Hint("axes", option if name == "whole unit" else {name: option})))
 
 
 # --------------------------------------------------------------------------------------------------------------- without a reference
@@ -714,16 +715,20 @@ def _without_reference(recording: Recording, sensors: _Sensors, step: int) -> _E
     return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))
 
 
+def _place(matrix: Array) -> int:
+    """Return the place of a matrix in :data:`AXES`."""
+    return int(np.argmax((matrix == AXES).all(axis=(1, 2))))
+
+
 @functools.cache
 def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray], list[tuple[Change, ...]]]:
     """Return explanations with one wrong sensor: which attitude by the gyro, which axes of each vector, and the changes."""
     rows = []
-    place = {matrix.tobytes(): k for k, matrix in enumerate(AXES)}
     for which, sign in enumerate((1.0, -1.0) * len(GYRO_UNITS)):
         for k, matrix in enumerate(AXES):
             if np.linalg.det(matrix) * sign > 0.0:
                 changes = _settings("gyro")[k * len(GYRO_UNITS) + which // 2]
-                rows.append((which, [place[(sign * matrix.T + 0.0).tobytes()]] * len(names), changes))
+                rows.append((which, [_place(sign * matrix.T)] * len(names), changes))
             if k and which == 0:
                 for name in names:
                     rows.append((which, [k * (other == name) for other in names], _settings(name)[k]))
