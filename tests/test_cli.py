@@ -410,7 +410,7 @@ def bad_csv(folder: Path, case: str) -> Path:
         ),
         ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
         ("infinite", "rate[7, 1] is inf"),
-        ("repeated", "time[7] repeats 0.06 s after 0.06 s; sort the stamps and drop repeated ones"),
+        ("repeated", "other samples: 1 of 300, the first 0.06 s in row 8; drop them"),
         ("short", "lasts 0.49 s; the start needs at least 1 s"),
         ("truncated", "data row 300 has 9 fields, the header 10; the file is truncated"),
     ],

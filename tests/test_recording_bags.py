@@ -184,7 +184,7 @@ def test_equal_stamps_are_not_out_of_order(bag):
     field = [("/imu/mag", "MagneticField", START + 5_000_001 * k, "m", [1e-5, 0, 0]) for k in (1, 2, 2, 3)]
     assert not any("sorted" in remark for remark in read(bag("mcap", content + field)).remarks)
     content[2] = (*content[2][:2], content[1][2], *content[2][3:])
-    with pytest.raises(InputError, match=r"time\[2\] repeats"):
+    with pytest.raises(InputError, match="other samples: 1 of 40"):
         read(bag("mcap", content, name="again"))
 
 

@@ -229,7 +229,7 @@ def _table(path: Path) -> Attitudes:
     places, frame = _places(path.name, table.header)
     time_place, time_unit = places["time"][""]
     numbers = table.load(sorted({place for group in places.values() for place, _ in group.values()}), time_place)
-    stamps = table.clock_ns(time_place, "")  # dates, or numbers so large that no other unit makes sense
+    stamps = table.clock_ns("")  # dates, or numbers so large that no other unit makes sense
     if stamps is None:
         stamps = _counted_ns(path.name, numbers[time_place], TIME_UNITS[time_unit.replace("sec", "s") or "s"])
     columns = {

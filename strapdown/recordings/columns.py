@@ -149,7 +149,6 @@ def recording(
     _need_whole_groups(source, header, roles)
     unit_of_group = _units(source, {_group(role) for role in roles}, declared, units)
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__
-    _need_digits(source, values, roles)
     stamps = clock_ns(roles["time"], declared.get("time", ""))
     if stamps is None:
         time, epoch = _seconds(values(roles["time"]), TIME_UNITS[unit_of_group["time"]])
@@ -349,29 +348,6 @@ def _units(
             )
         result[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
     return result
-
-
-SHORT_STAMPS = 0.1
-"""Share of rows with the stamp of the row before, above which the stamps have too few digits (below it, single rows are wrong)."""
-
-
-def _need_digits(source: str, values: Callable[[int], Array], roles: Mapping[str, int]) -> None:
-    """Reject stamps if more than one in ten equals that of the row before although the rows differ: they have too few digits."""
-    stamps = values(roles["time"])
-    same = np.flatnonzero(stamps[1:] == stamps[:-1])
-    if len(same) <= SHORT_STAMPS * len(stamps[1:]):
-        return
-    differ = np.zeros(len(same), bool)
-    for role in roles:
-        x = values(roles[role])
-        a, b = x[same], x[same + 1]
-        differ |= (a != b) & ~(np.isnan(a) & np.isnan(b))
-    repeats = same[differ]
-    if len(repeats) > max(2, SHORT_STAMPS * len(stamps[1:])):
-        raise InputError(
-            f"{source}: {len(repeats)} of {len(stamps)} rows have the stamp of the row before and other samples, the first of them "
-            f"{stamps[repeats[0] + 1]:.17g} in data row {repeats[0] + 2}; write the stamps with more digits"
-        )
 
 
 def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:

@@ -21,6 +21,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +29,9 @@ from numpy.typing import NDArray
 from strapdown.checks import Array, InputError
 from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
-from strapdown.records.recording import CLOCK_OFFSET, Recording
+from strapdown.records.recording import Recording
 
 SEPARATORS = ",;\t|"
-_LARGE = 10**15
-"""Integers above this may lose digits as float64."""
 
 
 def read_csv(
@@ -49,8 +48,8 @@ def read_csv(
     listed in ``repeated``. Options as for :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     table = Table(file)
-    header, load, clock_ns = table.header, table.load, table.clock_ns
-    return naming.recording(file.name, header, load, clock_ns, units=units, columns=columns, gyro_alone=gyro_alone)
+    options: dict[str, Any] = {"units": units, "columns": columns, "gyro_alone": gyro_alone}
+    return naming.recording(file.name, table.header, table.load, lambda _, unit: table.clock_ns(unit), **options)
 
 
 class Table:
@@ -60,8 +59,7 @@ class Table:
         self.source = file.name
         lines = io.StringIO(reading.text(file), newline="")
         self.header, self._separator, first = _head(self.source, lines)
-        self._whole: dict[int, list[int]] = {}  # columns of large integers
-        self._rows_read = 0
+        self._stamps: list[str] = []  # cells of the time
         rest = (line for line in lines if line.strip() and not line.lstrip().startswith("#"))
         self._rows = csv.reader(itertools.chain(first, rest), delimiter=self._separator)
 
@@ -81,34 +79,30 @@ class Table:
                 result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
             except ValueError:
                 result.append([self._number(k, j, row[j], j == time) for j in places])
-            if k == 0:
-                self._whole = {j: [] for j, x in zip(places, result[0], strict=True) if abs(x) >= _LARGE}
-            for j, whole in self._whole.items():
-                if re.fullmatch(r"\s*\d{1,19}\s*", row[j]):
-                    whole.append(int(row[j]))
-                elif j == time and (date := _date(row[j])) is not None:
-                    whole.append(date)
+            self._stamps.append(row[time])
         if not result:
             raise InputError(f"{self.source} has a header but no data rows")
-        self._rows_read = len(result)
         return dict(zip(places, np.array(result).T.copy(), strict=True))
 
     def _number(self, row: int, place: int, cell: str, time: bool) -> float:
         """Return a cell's number; it may have a decimal comma if that is not the separator, and a time may be a date."""
-        date = _date(cell) if time else None
-        if date is not None:
-            return float(date)
         try:
+            if time and (date := _date(cell)) is not None:
+                return float(date)
             return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
         except ValueError:
             where = f"data row {row + 1}, column {self.header[place]}"
             raise InputError(f"{self.source}: {where} is {cell!r}, not a number") from None
 
-    def clock_ns(self, k: int, unit: str) -> NDArray[np.int64] | None:
-        """Return the stamps of a loaded column of a unit, "" if unknown, that counts ns from 1970; None for other columns."""
-        whole = self._whole.get(k, [])
-        large = len(whole) == self._rows_read and whole[0] > CLOCK_OFFSET * 1e9
-        return np.array(whole, np.int64) if large and unit in ("", "ns") else None
+    def clock_ns(self, unit: str) -> NDArray[np.int64] | None:
+        """Return the loaded stamps, of a unit, "" if unknown, if they are dates, or integers that count ns from 1970; else None."""
+        if _date(self._stamps[0]) is not None:
+            stamps = list(map(_date, self._stamps))
+        elif unit in ("", "ns") and all(re.fullmatch(r"\s*\d{18,19}\s*", cell) for cell in self._stamps):
+            stamps = list(map(int, self._stamps))
+        else:
+            return None
+        return None if None in stamps else np.array(stamps, np.int64)
 
 
 def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]:

@@ -227,13 +227,19 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
     A log may have a row for each sensor: vectors and temperatures in rows without the gyro go to the nearest row with it that lacks them.
     """
     same = np.diff(time) == 0.0
-    if same.any() and np.mean(same) >= FEW_REPEATED:
-        for column in (rate, *columns.values()):
-            if np.shape(column)[:1] != time.shape:
-                continue  # absent, or of another length, which is rejected below
-            rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
-            same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
     columns |= {"time": time, "rate": rate}
+    if same.any() and np.mean(same) >= FEW_REPEATED:
+        held = [
+            np.reshape(c, (len(time), -1)) for n, c in columns.items() if n in _ROWS and np.shape(c)[:1] == time.shape
+        ]
+        rows = np.hstack(held).astype(np.float64)
+        other = same & np.any((rows[1:] != rows[:-1]) & ~(np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
+        if other.any():
+            row = int(np.argmax(other)) + 1
+            raise InputError(
+                f"{source}: rows with the stamp of the row before and other samples: {other.sum()} of {len(time)}, the first "
+                f"{time[row]:.9g} s in row {row + 1}; drop them, or write the stamps with more digits"
+            )
     if same.any():
         columns = _rows(columns, np.concatenate([[True], ~same])) | {"repeated": time[1:][same]}
     known = np.asarray(~np.isnan(columns["rate"]).any(axis=1))
