@@ -1288,7 +1288,7 @@ def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
         known = reference.copy()
         known[:300] = known[-7:] = np.nan
         path = tmp_path / "estimate.h5"
-        setup.write_estimate(path, dataclasses.replace(result.estimate, motion="hand", truth=Truth.of_reference(known)))
+        setup.write_estimate(path, dataclasses.replace(result.estimate, motion="hand", truth=Truth(attitude=known)))
         read_back = setup.read_estimate(path)
         np.testing.assert_array_equal(read_back.truth.attitude, known)
         verdicts.append(consistency.judge(read_back).verdict)

@@ -131,7 +131,7 @@ def test_of_right_filters_one_in_a_hundred_is_given_a_cause(memory):
     for _ in range(40):
         attitude, true = correlated(draw, memory)
         error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), true))
-        truth = Truth.of_reference(true)
+        truth = Truth(attitude=true)
         explanations = foreign.explanations(
             error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude)
         )

@@ -143,7 +143,6 @@ def test_missing_samples_of_every_kind_go_through_a_file(simulated, tmp_path):
         ("increments", "unit", "deg", r"increments is in 'deg', but must be in 'rad'; convert it"),
         ("truth/bias", "unit", b"deg/h", r"truth/bias is in 'deg/h', but must be in 'rad/s'"),
         ("vectors/0/time", "unit", "ms", r"vectors/0/time is in 'ms', but must be in 's'"),
-        ("/", "conventions", "quaternions scalar last", r"follows other conventions \(quaternions scalar last\)"),
     ],
 )
 def test_units_and_conventions_that_contradict_are_refused(simulated, tmp_path, where, name, value, words):

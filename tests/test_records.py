@@ -230,7 +230,7 @@ def test_sigma_and_nis():
 
 def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
     written = estimate()
-    truth = Truth.of_reference(written.attitude, np.arange(7) > 3)
+    truth = Truth(attitude=written.attitude, movement=np.arange(7) > 3)
     write_estimate(tmp_path / "e.h5", dataclasses.replace(written, truth=truth))
     read_truth = read_estimate(tmp_path / "e.h5").truth
     assert read_truth == truth
@@ -273,13 +273,13 @@ def test_foreign_files_are_refused(tmp_path):
         ("bias", lambda x: x[:, 0], r"bias has shape"),
         ("bias", lambda x: np.array(["1.0"] * 7, dtype="S3"), r"bias "),
         ("attitude", lambda x: 2.0 * x, r"attitude\[0\] has norm 2"),
-        ("attitude", lambda x: None, r"attitude is a group and not an array; .*make it again"),
-        ("time", lambda x: None, r"time is a group and not an array"),
+        ("attitude", lambda x: None, r"attitude is not an array of numbers; .*make it again"),
+        ("time", lambda x: None, r"time is not an array"),
         ("time", lambda x: 1.0, r"time has shape \(\)"),
-        ("innovations/000000/innovation", lambda x: None, r"innovations/000000/innovation is a group"),
+        ("innovations/000000/innovation", lambda x: None, r"innovations/000000/innovation is not an array"),
         ("truth/bias", lambda x: -1e200 + x, r"truth/bias\[0, 0\] is -1e\+200 rad/s"),
         ("truth/attitude", lambda x: x[1:], r"truth/attitude has shape"),
-        ("truth/attitude", lambda x: None, r"truth/attitude is a group"),
+        ("truth/attitude", lambda x: None, r"truth/attitude is not an array"),
     ],
 )
 def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):

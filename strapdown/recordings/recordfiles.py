@@ -18,7 +18,7 @@ import strapdown
 from strapdown import gyro
 from strapdown.checks import Array, InputError, count
 from strapdown.files import reading, set_attributes
-from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result_file
+from strapdown.records import ImuRecord, Origin, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
 
 KIND = "strapdown record"
@@ -87,10 +87,6 @@ def read_record(path: str | os.PathLike[str]) -> ImuRecord:
         if count("format", attributes["format"]) > FORMAT:
             raise InputError(
                 f"{path} has layout {attributes['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
-            )
-        if attributes.get("conventions", CONVENTIONS) != CONVENTIONS:
-            raise InputError(
-                f"{path} follows other conventions ({attributes['conventions']}); convert it to those of this package: {CONVENTIONS}"
             )
         group = file.get("vectors", {})
         series = tuple(_series(group[str(number)]) for number in range(len(group)))

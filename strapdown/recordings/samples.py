@@ -75,22 +75,11 @@ def read_samples(
     else:
         recording = formats.read(file, units=unit_of_sensor, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
         samples = samples_of(recording, sensor)
-    largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
     if samples.values.shape[1] not in (1, 3):
         raise InputError(
             f"{file.name} has {samples.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
         )
-    if largest > LARGEST:
-        raise InputError(f"{file.name} holds {largest:g}, SI, which no {sensor} measures; check its unit")
-    if not 1.0 / LARGEST <= samples.sample_interval <= LARGEST:
-        raise InputError(
-            f"{file.name}: {1.0 / samples.sample_interval:g} Hz is no sample rate of a {sensor}; check it and its unit"
-        )
     return samples
-
-
-LARGEST = 1e12
-"""Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
 
 
 def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: str = "record") -> GyroSamples:

@@ -34,15 +34,20 @@ class Truth(ByValue):
     ----------
     attitude : ndarray (n + 1, 4)
         True q_fb at the edges. NaN where a reference system has no attitude.
-    bias : ndarray (n + 1, 3)
-        True gyro bias at the edges, rad/s. NaN if it is not known, as from a reference system.
+    bias : ndarray (n + 1, 3), optional
+        True gyro bias at the edges, rad/s. Default: NaN, not known, as from a reference system.
     movement : ndarray (n + 1,) of bool, optional
         Whether the unit moved, in the judgement of the reference's source; None: not stated.
     """
 
     attitude: Array
-    bias: Array
+    bias: Array = None  # type: ignore[assignment]
     movement: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Fill in a bias that is not known."""
+        if self.bias is None:
+            object.__setattr__(self, "bias", np.full((len(self.attitude), 3), np.nan))
 
     @property
     def known(self) -> np.ndarray:
@@ -53,24 +58,6 @@ class Truth(ByValue):
     def has_bias(self) -> bool:
         """Whether the gyro bias is known."""
         return bool(np.isfinite(self.bias).any())
-
-    @classmethod
-    def of_reference(cls, attitude: Array, movement: np.ndarray | None = None) -> Truth:
-        """Return the truth that the attitudes of a reference system give; the bias is not known.
-
-        Parameters
-        ----------
-        attitude : ndarray (m, 4)
-            Unit quaternions q_fb, NaN where there is none.
-        movement : ndarray (m,) of bool, optional
-            Whether the unit moved.
-
-        Returns
-        -------
-        Truth
-            Truth with a bias of NaN.
-        """
-        return cls(attitude=attitude, bias=np.full((len(attitude), 3), np.nan), movement=movement)
 
     def taken(self, rows: Any) -> Truth:
         """Return the truth at some of its rows.

@@ -233,7 +233,7 @@ def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | No
         attitude = reference[edges][: len(record.time)].copy()
         if case.judged is not None:
             attitude[~case.judged[edges][: len(record.time)]] = np.nan
-        truth = Truth.of_reference(attitude)
+        truth = Truth(attitude=attitude)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     estimate = setup.run_modelled(record, used, initial, every=every, full_covariance=truth is not None)
 

@@ -308,7 +308,7 @@ def _run_recording(
         result.estimate,
         setup=dataclasses.replace(parameters.setup, gate=gate, robust=robust),
         origin=Origin(source=used.source, epoch_ns=used.epoch_ns),
-        truth=None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement),
+        truth=None if used.true_attitude is None else Truth(attitude=used.true_attitude, movement=used.movement),
         fixed_frame=fixed_frame(used),
         motion=motion,
         smoothed=smooth,

@@ -180,7 +180,7 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
     )
     whole = truth.truth if isinstance(truth, ImuRecord) else None
     if isinstance(truth, Recording) and truth.true_attitude is not None:
-        whole = Truth.of_reference(truth.true_attitude, truth.movement)
+        whole = Truth(attitude=truth.true_attitude, movement=truth.movement)
     if whole is None:
         raise InputError("truth is a record without a truth; leave it out to test the innovations only")
     rows, same = matched(truth.time, result.time, SAME_STAMP)
