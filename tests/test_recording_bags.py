@@ -214,11 +214,10 @@ def test_a_message_of_another_layout_is_named(bag):
     """A type of the right name and another definition: its message is too short."""
     from strapdown.recordings import ros
 
-    topic = ros.Topic("/imu", ros.IMU, ros2=True, span=ros.READ[ros.IMU])
-    for k, size in enumerate((340, 20)):
-        topic.add(k, bytes([0, 1, 0, 0]) + bytes(size))
+    messages = [bytes([0, 1, 0, 0]) + bytes(size) for size in (340, 20)]
+    topic = ros.Topic("/imu", ros.IMU, ros2=True, logged=[0, 1], raw=messages)
     with pytest.raises(InputError, match=r"x.bag, topic /imu: message 2 is 24 bytes long, shorter than its type"):
-        topic.decoded("x.bag")
+        topic.decoded("x.bag", ros.READ[ros.IMU])
 
 
 def tesla(*size, **options) -> Recording:

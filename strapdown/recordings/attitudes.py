@@ -343,7 +343,7 @@ def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
     topics = ros.topics_of(path, ros.ORIENTED)
     oriented = ros.topic_of(path.name, topics, topic, "topics with orientations", list(ros.ORIENTED))
-    stamps, values, order_words = oriented.decoded(path.name)
+    stamps, values, order_words = oriented.decoded(path.name, ros.ORIENTED[oriented.kind])
     q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
     known = q.any(axis=1) & (P[:, 0] != -1.0 if P.size else True)
     if known.sum() < 2:

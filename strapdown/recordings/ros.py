@@ -56,54 +56,24 @@ TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperatur
 """Topics that are written, with the names of REP 145."""
 WITH_ORIENTATION = "/imu/data"
 FRAME = "imu_link"
-BATCH = 1024
-"""Number of messages processed at once: processing each one separately would double the time."""
 
 
 @dataclass(eq=False)
 class Topic:
-    """The messages of one topic in the order of the recorder's times: decoded, or raw if they are to be copied."""
+    """The messages of one topic in the order of the recorder's times."""
 
     name: str
     kind: str
     ros2: bool
     definition: str = ""
     """Definition of the messages' type that the bag has."""
-    span: tuple[int, int] | None = None
-    """Range of the doubles to decode; None: the messages remain raw."""
     logged: list[int] = field(default_factory=list)
     """Times of the recorder, ns."""
     raw: list[bytes] = field(default_factory=list)
-    """Messages that are not decoded."""
-    parts: list[tuple[NDArray[np.int64], Array]] = field(default_factory=list)
-    """Stamps, ns, and numbers of the messages, by batch."""
-    fault: str = ""
-    """Fault of the first message that cannot be decoded."""
 
-    def add(self, logged: int, data: bytes) -> None:
-        """Append a message."""
-        self.raw.append(data)
-        self.logged.append(logged)
-        if self.span is not None and len(self.raw) == BATCH:
-            self._decode()
-
-    def _decode(self) -> None:
-        assert self.span is not None
-        if not self.fault:
-            try:
-                before = len(self.logged) - len(self.raw)
-                self.parts.append(_decoded(self.raw, self.kind, self.span, self.ros2, before))
-            except InputError as error:
-                self.fault = str(error)
-        self.raw = []
-
-    def decoded(self, source: str) -> tuple[NDArray[np.int64], Array, list[str]]:
-        """Return stamps (n,), ns, and numbers (n, d) of the messages in order of time, and remarks."""
-        if self.raw:
-            self._decode()
-        if self.fault:
-            raise InputError(f"{source}, topic {self.name}: {self.fault}; the bag is damaged or of another type")
-        stamps, values = (np.concatenate(column) for column in zip(*self.parts, strict=True))
+    def decoded(self, source: str, span: tuple[int, int]) -> tuple[NDArray[np.int64], Array, list[str]]:
+        """Return stamps (n,), ns, and a range of the numbers (n, d) of the messages in order of time, and remarks."""
+        stamps, values = _decoded(f"{source}, topic {self.name}", self.raw, self.kind, span, self.ros2)
         remarks = []
         if not stamps.any() and len(stamps) > 1:
             stamps = np.array(self.logged, np.int64)
@@ -129,7 +99,7 @@ def read_bag(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     topics = topics_of(file, READ)
     topic_name = topic_of(file.name, topics, topic, "inertial units", [IMU]).name
-    stamps, values, order_words = topics[topic_name].decoded(file.name)
+    stamps, values, order_words = topics[topic_name].decoded(file.name, READ[IMU])
     said = [f"Topic {topic_name}: {len(stamps)} messages.", *order_words]
     if values[0, 3] == -1.0:
         raise InputError(
@@ -144,7 +114,7 @@ def read_bag(file: Path, *, topic: str) -> Recording:
             said.append(other)
         if not isinstance(other, Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
             continue
-        other_stamps, other_values, words = other.decoded(file.name)
+        other_stamps, other_values, words = other.decoded(file.name, READ[kind])
         # In ROS, w is last in a quaternion.
         places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]
         own[name], remark = beside(other.name, other_stamps, other_values[:, places], time, epoch)
@@ -185,16 +155,17 @@ def _beside(unit: str, candidates: list[Topic], units: list[str]) -> Topic | str
 
 
 def _decoded(
-    raws: Sequence[bytes], kind: str, span: tuple[int, int], ros2: bool, before: int
+    place: str, raws: Sequence[bytes], kind: str, span: tuple[int, int], ros2: bool
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (n,), ns, and a range of the doubles (n, d) of messages of a type; ``before`` is the number of earlier messages."""
+    """Return stamps (n,), ns, and a range of the doubles (n, d) of messages of a type."""
     first, last = span
     lengths = np.fromiter(map(len, raws), np.int64, len(raws))
     stamps, values = np.empty(len(raws), np.int64), np.empty((len(raws), last - first))
 
     def refuse(wrong: NDArray[np.bool_], rows: NDArray[np.int64], what: str) -> None:
         if wrong.any():
-            raise InputError(f"message {before + int(rows[np.argmax(wrong)]) + 1} is {what}")
+            number = int(rows[np.argmax(wrong)]) + 1
+            raise InputError(f"{place}: message {number} is {what}; the bag is damaged or of another type")
 
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
@@ -208,22 +179,19 @@ def _decoded(
         if kind == ODOMETRY:  # the name of a second frame
             begin += -begin % 4 if ros2 else 0
             refuse(begin + 4 > length, rows, short)
-            place = begin[:, None] + np.arange(4)
-            begin += 4 + np.take_along_axis(table, place, axis=1).view("<u4")[:, 0]
+            bytes_of_length = begin[:, None] + np.arange(4)
+            begin += 4 + np.take_along_axis(table, bytes_of_length, axis=1).view("<u4")[:, 0]
         begin += -(begin - 4) % 8 if ros2 else 0  # CDR aligns doubles
         refuse(begin + 8 * DOUBLES[kind] > length, rows, short)
-        for place in np.unique(begin).tolist():
-            same = np.flatnonzero(begin == place)
-            values[rows[same]] = table[:, place + 8 * first : place + 8 * last][same].view("<f8")
+        for start in np.unique(begin).tolist():
+            same = np.flatnonzero(begin == start)
+            values[rows[same]] = table[:, start + 8 * first : start + 8 * last][same].view("<f8")
         stamps[rows] = words[:, 0] * 10**9 + words[:, 1]
     return stamps, values
 
 
-def topics_of(path: Path, spans: Mapping[str, tuple[int, int]]) -> dict[str, Topic]:
-    """Return the messages of a bag by topic.
-
-    ``spans`` are the types to read, with the range of their doubles; if it is empty, all messages are returned raw.
-    """
+def topics_of(path: Path, kinds: Collection[str] = ()) -> dict[str, Topic]:
+    """Return the messages of a bag by topic, of these types or, if there are none, of all."""
     ros2 = path.is_dir()
     if not ros2:
         with reading.opened(path) as file:
@@ -232,12 +200,13 @@ def topics_of(path: Path, spans: Mapping[str, tuple[int, int]]) -> dict[str, Top
     topics: dict[str, Topic] = {}
     try:
         with rosbag.Reader(path) as reader:
-            connections = [each for each in reader.connections if not spans or each.msgtype in spans]
+            connections = [each for each in reader.connections if not kinds or each.msgtype in kinds]
             for each in connections:
                 definition = each.msgdef.data if each.msgdef.format.name == "MSG" else ""
-                topics[each.topic] = Topic(each.topic, each.msgtype, ros2, definition, spans.get(each.msgtype))
+                topics[each.topic] = Topic(each.topic, each.msgtype, ros2, definition)
             for connection, logged, data in reader.messages(connections) if connections else ():
-                topics[connection.topic].add(logged, data)
+                topics[connection.topic].logged.append(logged)
+                topics[connection.topic].raw.append(data)
     except rosbag.ReaderError as error:
         raise InputError(
             f"{path.name} cannot be read as a ROS bag ({error}); if its recorder was killed, repair it by `rosbag reindex`, "
@@ -270,7 +239,7 @@ def write_estimate(
     if source is not None:
         ros2 = target.suffix.lower() != ".bag"
         written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
-        topics = topics_of(source, {}).values()
+        topics = topics_of(source).values()
         others = [t for t in topics if t.ros2 == ros2 and t.kind != IMU and t.name not in written]
     _write(target, series, others)
 
