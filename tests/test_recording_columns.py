@@ -39,6 +39,8 @@ HEADERS = {
     "imu prefix": "Time [s],imu_gyro_x [dps],imu_gyro_y,imu_gyro_z,imu_acc_x [g],imu_acc_y,imu_acc_z,imu_mag_x [uT],imu_mag_y,imu_mag_z",
     "logger": "loggingTime(s),gyroRotationX(deg/s),gyroRotationY(deg/s),gyroRotationZ(deg/s),accelerometerAccelerationX(G),"
     "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),magnetometerX(µT),magnetometerY(µT),magnetometerZ(µT)",
+    "blackbox": "time (s),gyroADC[0] (deg/s),gyroADC[1] (deg/s),gyroADC[2] (deg/s),accSmooth[0] (g),accSmooth[1] (g),accSmooth[2] (g),"
+    "magADC[0] (uT),magADC[1] (uT),magADC[2] (uT)",
     "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
     "joined, unit": "time,gyrox_dps,gyroy_dps,gyroz_dps,accx_g,accy_g,accz_g,magx_uT,magy_uT,magz_uT",
 }

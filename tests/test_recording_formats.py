@@ -257,22 +257,6 @@ def test_a_table_is_text_wherever_its_beginning_is_cut(tmp_path, kept):
     assert read(tmp_path / "table.dat").rate.shape == (5, 3)
 
 
-def test_a_decoded_blackbox_is_a_table(tmp_path):
-    """What blackbox_decode writes with units."""
-    path = tmp_path / "log.csv"
-    head = [
-        "loopIteration",
-        "time (us)",
-        *(f"gyroADC[{k}] (deg/s)" for k in range(3)),
-        *(f"accSmooth[{k}] (g)" for k in range(3)),
-    ]
-    path.write_text(",".join(head) + "\n" + "".join(f"{k},{1000 * k},1,2,3,0,0,1\n" for k in range(5)))
-    recording = read(path)
-    np.testing.assert_allclose(recording.time, 1e-3 * np.arange(5), atol=1e-12)
-    np.testing.assert_allclose(recording.rate[0], np.radians([1, 2, 3]), rtol=1e-15)
-    np.testing.assert_allclose(recording.specific_force[0], [0, 0, 9.80665], rtol=1e-15)
-
-
 # --------------------------------------------------------------------------------------------- EuRoC, trajectories
 
 
@@ -388,27 +372,6 @@ def test_what_is_written_comes_back_to_the_bit(tmp_path, ending, epoch):
     assert (back.parts, back.magnetic_unit) == (whole.parts, whole.magnetic_unit)
     assert back.remarks == () or needed == "rosbags"
     assert [path.name for path in tmp_path.iterdir()] == [f"x.{ending}"]
-
-
-@pytest.mark.parametrize(("first", "second"), [*zip(ROUND, ROUND), *zip(ROUND, (*ROUND[1:], ROUND[0]))])  # noqa: B905
-def test_from_each_to_itself_and_the_next_and_back_loses_nothing_that_both_hold(tmp_path, first, second):
-    for name in ("rosbags", "pyarrow"):
-        pytest.importorskip(name, reason=f"{name} {MISSING}")
-    whole = replace(walk(single=True), temperature=None, movement=None)
-    recordings.write(whole, tmp_path / f"a.{first}")
-    for source, target in ((f"a.{first}", f"b.{second}"), (f"b.{second}", f"c.{first}")):
-        status, said = convert(tmp_path / source, tmp_path / target)
-        assert status == 0, said
-    back = read(tmp_path / f"c.{first}")
-    same(back, whole, "rate", "specific_force")
-    factor = {"G": 1.0, "T": 1e4}[back.magnetic_unit]
-    np.testing.assert_allclose(back.magnetic_field * factor, whole.magnetic_field, rtol=1e-6)
-    known = ~np.isnan(back.true_attitude[:, 0])
-    assert known.sum() >= 59
-    angle = quaternion.angle_between(
-        quaternion.normalize(back.true_attitude[known]), quaternion.normalize(whole.true_attitude[known])
-    )
-    assert angle.max() < 1e-6
 
 
 def test_what_the_target_has_no_room_for_is_said(tmp_path):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import random
 import re
-import sqlite3
 
 import h5py
 import numpy as np
@@ -172,39 +170,7 @@ def _change_array(chance: random.Random, node: h5py.Dataset) -> None:
         parent[name] = chance.choice((1.0, "text", h5py.Empty("f8"), np.zeros(0), np.zeros((2, 0)), ["a", "b"]))
 
 
-# ------------------------------------------------------------------------------------------------------- SQLite and Parquet
-
-
-def change_sqlite(chance: random.Random, content: bytes) -> bytes:
-    """Change rows, types and tables of a ROS 2 database."""
-    with contextlib.closing(sqlite3.connect(":memory:")) as held:
-        held.deserialize(content)
-        table, column = chance.choice(
-            (("messages", "data"), ("messages", "timestamp"), ("messages", "topic_id"), ("topics", "name"), ("topics", "type"))
-        )  # fmt: skip
-        value = chance.choice(
-            ("'text'", "x''", "x'00010000'", "0", "-1", "9e99", str(2**62), "zeroblob(400)", "x'28b52ffd00'")
-        )
-        statement = chance.choice(
-            (
-                f"UPDATE {table} SET {column} = {value}",
-                f"UPDATE {table} SET {column} = {value} WHERE id % 7 = {chance.randrange(7)}",
-                f"DELETE FROM {table} WHERE id % 3 = 1",
-                f"DROP TABLE {table}",
-                f"ALTER TABLE {table} RENAME COLUMN {column} TO other",
-                f"ALTER TABLE {table} RENAME TO other; CREATE VIEW {table} AS {ENDLESS}",
-                f"ALTER TABLE {table} RENAME TO other; CREATE TABLE {table} AS SELECT * FROM other",
-                f"ALTER TABLE {table} ADD COLUMN made AS (hex(zeroblob(90000000)))",
-            )
-        )
-        held.executescript(statement)
-        return held.serialize()
-
-
-ENDLESS = (
-    "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS id, 'x' AS name, 'sensor_msgs/msg/Imu' AS type, "
-    "1 AS topic_id, i AS timestamp, x'00010000' AS data FROM n"
-)
+# ------------------------------------------------------------------------------------------------------- Parquet
 
 
 def change_parquet(chance: random.Random, content: bytes) -> bytes:

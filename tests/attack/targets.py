@@ -138,7 +138,6 @@ def foreign(folder: Path) -> list[Target]:
             (write_ulog if ending == "ulg" else recordings.write)(whole, path)
             more = {
                 "ulg": (damage.replace_word,) * 3,
-                "db3": (damage.change_sqlite,) * 3,
                 "parquet": (damage.change_parquet,) * 2,
             }
             damages += more.get(ending, ())
