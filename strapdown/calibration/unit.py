@@ -20,28 +20,18 @@ from strapdown.results import ByValue, Column, Listed, Table
 
 AXES = ("x", "y", "z")
 MILLISECONDS: tables.Choice = (("ms", 1e-3), ("s", 1.0))
-FORM: tables.Form = {
-    "gyro_bias": tables.DEGREES_PER_SECOND,
-    "gyro_matrix": tables.PLAIN,
-    "accelerometer_bias": tables.METRES_PER_SECOND_SQUARED,
-    "accelerometer_matrix": tables.PLAIN,
-    "hard_iron": tables.PLAIN,
-    "magnetometer_matrix": tables.PLAIN,
-    "accelerometer_delay": MILLISECONDS,
-    "magnetometer_delay": MILLISECONDS,
+_FIELDS: dict[str, tuple[tables.Choice, str, str]] = {
+    "gyro_bias": (tables.DEGREES_PER_SECOND, "gyro bias", "°/s"),
+    "gyro_matrix": (tables.PLAIN, "gyro", "%"),
+    "accelerometer_bias": (tables.METRES_PER_SECOND_SQUARED, "accelerometer bias", "m/s²"),
+    "accelerometer_matrix": (tables.PLAIN, "accelerometer", "%"),
+    "hard_iron": (tables.PLAIN, "hard iron", "unit of the field"),
+    "magnetometer_matrix": (tables.PLAIN, "magnetometer", "%"),
+    "accelerometer_delay": (MILLISECONDS, "accelerometer delay", "ms"),
+    "magnetometer_delay": (MILLISECONDS, "magnetometer delay", "ms"),
 }
-"""Fields of :class:`SensorErrors` and the units of their keys."""
-WORDS = {
-    "gyro_bias": ("gyro bias", "°/s"),
-    "gyro_matrix": ("gyro", "%"),
-    "accelerometer_bias": ("accelerometer bias", "m/s²"),
-    "accelerometer_matrix": ("accelerometer", "%"),
-    "hard_iron": ("hard iron", "unit of the field"),
-    "magnetometer_matrix": ("magnetometer", "%"),
-    "accelerometer_delay": ("accelerometer delay", "ms"),
-    "magnetometer_delay": ("magnetometer delay", "ms"),
-}
-"""Name and printed unit of each field."""
+"""Fields of :class:`SensorErrors`: the units of their keys in a file, their name and unit in print."""
+FORM: tables.Form = {name: choice for name, (choice, _, _) in _FIELDS.items()}
 SCALE = {"°/s": np.pi / 180.0, "%": 0.01, "ms": 1e-3}
 """Printed units in SI."""
 
@@ -117,7 +107,7 @@ class SensorErrors(ByValue):
 
 def printed(name: str, axes: str, magnetic_unit: str) -> tuple[str, str, float]:
     """Return the words for an entry of a field of :class:`SensorErrors`, its printed unit, and this unit in SI."""
-    words, unit = WORDS[name]
+    _, words, unit = _FIELDS[name]
     if name.endswith("matrix"):
         off = "soft iron" if name == "magnetometer_matrix" else "misalignment"
         words = f"{words} {'scale' if len(axes) == 1 else off}"
