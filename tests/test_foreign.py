@@ -674,7 +674,7 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         ("qw,qx,qy,qz", "1,0,0,0", "lacks time"),
         ("time_s,qw,qx,qy,qz", "1,2,0,0,0", "norm 2"),
         ("time_s,qw,qx,qy,qz,cov_xx_rad2,cov_yy_rad2", "1,1,0,0,0,1,1", "cov_zz is missing|cov_xy is missing"),
-        ("time_s,qw,qx,qy,qz,cov_body_xx,cov_fixed_yy", "1,1,0,0,0,1,1", "name all its columns alike"),
+        ("time_s,qw,qx,qy,qz,cov_body_xx,cov_fixed_yy", "1,1,0,0,0,1,1", "give all of one kind"),
         ("time_s,qw,qx,qy,qz,q_w", "1,1,0,0,0,1", "has the same meaning"),
         (
             "time_s,qw,qx,qy,qz,roll_sigma_deg,pitch_sigma_deg,yaw_sigma_deg",

@@ -334,7 +334,7 @@ def test_a_trajectory_is_a_reference(tmp_path):
     path.write_text("-1.25 0 0 0 0 0 0 1\n-0.5 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     assert recordings.read_tum(path)[0].tolist() == [-1_250_000_000, -500_000_000, 2_000_000_000]
     path.write_text("1 2 3\n")
-    with pytest.raises(InputError, match=r"data row 1 has 3 numbers; a TUM trajectory has time tx"):
+    with pytest.raises(InputError, match=r"data row 1 has 3 numbers, not time tx"):
         recordings.read_tum(path)
 
 

@@ -143,7 +143,7 @@ REFUSED = {
         for bad in ("inf", "-Infinity")
     },
     "infinite force": (HEADER, [ROWS[0], SECOND.replace("4,8", "inf,8")], "specific_force[1, 1] is inf"),
-    "hardly a sample": (HEADER, [ROWS[0], SECOND.replace("0.5", "")], "1 of 2 rows have a gyro sample about each axis", "at least 2"),
+    "hardly a sample": (HEADER, [ROWS[0], SECOND.replace("0.5", "")], "1 of 2 rows have a whole gyro sample", "at least 2"),
     "gap and back": (HEADER, [ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]], "time[2] goes back to 0.01 s"),
     "back": (HEADER, [ROWS[0], ROWS[2], ROWS[1]], "time[2] goes back to 0.01 s", "sort"),
     "no row": (HEADER, [], "no data rows"),

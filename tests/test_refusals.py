@@ -393,9 +393,9 @@ def test_sigma_of_an_angle_in_another_unit_is_reported(folder, short, tmp_path, 
 @pytest.mark.parametrize(
     ("rate", "factor", "words"),
     [
-        (1e300, 1.0, "1e+300 Hz is no sample rate of a gyro"),
-        (1e-300, 1.0, "1e-300 Hz is no sample rate of a gyro"),
-        (100.0, 1e300, "which no gyro measures; check its unit"),
+        (1e300, 1.0, "no gyro has 1e+300 Hz"),
+        (1e-300, 1.0, "no gyro has 1e-300 Hz"),
+        (100.0, 1e300, "no gyro has 100 Hz and "),
     ],
 )
 def test_allan_refuses_what_no_gyro_measures(tmp_path, rate, factor, words):

@@ -93,9 +93,7 @@ def calibrate(
         raise InputError(f"the units of the fields are {', '.join(map(repr, units))}; declare one unit for all")
     intervals = gathered(used)
     if len(intervals.node) < 4 * 10:
-        raise InputError(
-            f"the recordings last {np.sum(intervals.length):.3g} s; a calibration needs at least 10 s, better a minute"
-        )
+        raise InputError(f"the recordings last {np.sum(intervals.length):.3g} s; a calibration needs at least 10 s")
     bias = _resting_bias(intervals)
     strength, intervals, prior = _priors(intervals, bias)
     attitude = _initial_attitude(intervals, prior.mean, bias)

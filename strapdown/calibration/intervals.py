@@ -76,9 +76,7 @@ def gathered(recordings: Sequence[Recording]) -> Intervals:
     """Return the intervals of recordings; parts between gaps are separate, and those shorter than :data:`SHORTEST` are left out."""
     parts = [part for recording in recordings for part in _parts(sensor_faults.find(recording).recording)]
     if not parts:
-        raise InputError(
-            f"{recordings[0].source} has no part of {SHORTEST:g} s without gaps; a calibration needs about a minute"
-        )
+        raise InputError(f"{recordings[0].source} has no part of {SHORTEST:g} s without gaps, and none is used")
     interval = float(np.median(np.concatenate([np.diff(part.time) for part in parts])))
     edges = [_edges(part.time) for part in parts]
     width = max(int(np.diff(edge).max()) for edge in edges)

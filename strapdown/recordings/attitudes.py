@@ -279,9 +279,7 @@ def _places(file: str, header: Sequence[str]) -> tuple[dict[str, dict[str, tuple
                 raise InputError(f"{file}: column {cell} has the same meaning as column {header[places[name][key][0]]}")
             places[name][key] = (place, parts.get("unit") or "")
     if len(frames) > 1:
-        raise InputError(
-            f"{file}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
-        )
+        raise InputError(f"{file}: its covariance is of {' and '.join(sorted(frames))} axes; give all of one kind")
     if set(places["q"]) != set("wxyz") or not places["time"]:
         raise InputError(
             f"{file} lacks {'time' if not places['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "

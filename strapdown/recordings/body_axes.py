@@ -64,9 +64,7 @@ def with_axes(
 
 def _turned(source: str, attitude: Array, turn: Array) -> Array:
     if np.linalg.det(turn) < 0.0:
-        raise InputError(
-            f"{source}: axes mirror the unit, but its reference attitude can only be rotated; give the axes of single sensors"
-        )
+        raise InputError(f"{source}: axes mirror the unit, which its reference cannot be; give those of single sensors")
     known = np.isfinite(attitude).all(axis=1)
     result = attitude.copy()
     result[known] = quaternion.multiply(attitude[known], quaternion.from_matrix(turn))

@@ -25,9 +25,7 @@ def read_broad(path: Path) -> Recording:
         held = reading.attributes(file)
         kind = str(held.get("kind", ""))
         if kind == recordfiles.KIND:
-            raise InputError(
-                f"{name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
-            )
+            raise InputError(f"{name} is a simulated record, not a recording; use `strapdown integrate` or `estimate`")
         if kind.startswith("strapdown "):
             raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
         missing = ["imu_gyr"] * ("imu_gyr" not in file)
@@ -61,8 +59,8 @@ def sample_interval(source: str, time: Array) -> float:
     worst = int(np.argmax(np.abs(steps - mean)))
     if abs(steps[worst] - mean) > EVEN * mean:
         raise InputError(
-            f"{source}: the interval after {time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the recording to a part "
-            "with equal sample intervals"
+            f"{source}: the interval after {time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; "
+            "cut the recording to a part with equal sample intervals"
         )
     return mean
 

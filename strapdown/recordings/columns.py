@@ -344,7 +344,7 @@ def _units(
             )
         if option and declared.get(group) and option != declared[group]:
             raise InputError(
-                f"{source}: the header declares {declared[group]} for the {group}, but the option is {option}; drop one"
+                f"{source}: the header declares {declared[group]} for the {group}, the option is {option}; drop one"
             )
         result[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
     return result

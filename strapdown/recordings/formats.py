@@ -144,9 +144,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     *others, table = FORMATS
     recognised = [candidate for candidate in others if candidate.recognised(file, head)]
     if file.is_dir() and not recognised:
-        raise InputError(
-            f"{path} is a folder; name the file in it (folders that can be read: a ROS 2 bag, or EuRoC with imu0/data.csv)"
-        )
+        raise InputError(f"{path} is a folder; name the file in it, unless it is a ROS 2 bag or EuRoC with imu0")
     recognised += [candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings]
     if table.recognised(file, head) and file.suffix.lower() != ".toml":
         recognised.append(table)
@@ -157,9 +155,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
         for candidate in FORMATS
         if candidate.read
     )
-    raise InputError(
-        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {', '.join(known)}"
-    )
+    raise InputError(f"{file} has the extension {file.suffix!r} and no known content; known are {', '.join(known)}")
 
 
 _REASONS = {
@@ -185,7 +181,7 @@ def read(
     file_format = format_of(file)
     if file_format.read is None:
         raise InputError(
-            f"{file.name} is a {file_format.name}, which has no inertial samples; give the recording, and this file as its reference"
+            f"{file.name} is a {file_format.name}, which has no inertial samples; give it as the reference of a recording"
         )
     options = {"units": units or {}, "columns": columns or {}, "topic": topic, "gyro_alone": gyro_alone}
     for name, reason in _REASONS.items():
@@ -237,8 +233,7 @@ def estimate_format(
             outputs.euler([[1.0, 0.0, 0.0, 0.0]], value)
     if file_format.with_samples and not recording:
         raise InputError(
-            f"{path} ({file_format.name}) needs the samples too; give the recording that the estimate was made from, or choose another "
-            "extension"
+            f"{path} ({file_format.name}) needs the samples too; give the recording that the estimate was made from"
         )
     return file_format
 

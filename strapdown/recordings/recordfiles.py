@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import strapdown
 from strapdown import gyro
 from strapdown.checks import Array, InputError, count
 from strapdown.files import reading, set_attributes
@@ -86,7 +85,7 @@ def read_record(path: str | os.PathLike[str]) -> ImuRecord:
             )
         if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has layout {attributes['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
+                f"{path} has layout {attributes['format']}, and this version reads up to {FORMAT}; update it"
             )
         group = file.get("vectors", {})
         series = tuple(_series(group[str(number)]) for number in range(len(group)))
@@ -167,7 +166,6 @@ def _series(group: Any) -> VectorMeasurements:
     attributes = reading.attributes(group)
     if attributes["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
         raise InputError(
-            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) has no sigma; give each measurement its standard "
-            "deviation"
+            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) has no sigma; give each measurement one"
         )
     return VectorMeasurements(sensor=attributes["sensor"], kind=attributes["kind"], **fields)

@@ -102,9 +102,7 @@ def read_bag(file: Path, *, topic: str) -> Recording:
     stamps, values, order_words = topics[topic_name].decoded(file.name, READ[IMU])
     said = [f"Topic {topic_name}: {len(stamps)} messages.", *order_words]
     if values[0, 3] == -1.0:
-        raise InputError(
-            f"{file.name}, topic {topic_name}: message 1 declares that it has no angular velocity; choose another topic"
-        )
+        raise InputError(f"{file.name}, topic {topic_name}: its messages have no angular velocity; choose another")
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
     units = [t.name for t in topics.values() if t.kind == IMU]
@@ -252,7 +250,7 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
     stamps = recording.clock_ns
     if stamps[0] < 0:
         raise InputError(
-            f"{recording.source}: time begins at {recording.time[0]:g} s, and a bag's clock has no negative times; shift it"
+            f"{recording.source}: time begins at {recording.time[0]:g} s, and a bag has no negative times; shift it"
         )
     imu = np.zeros((len(stamps), DOUBLES[IMU]))
     imu[:, 3] = 1.0
@@ -285,7 +283,7 @@ def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> N
     places, same = matched(recording.time, estimate.time, 1e-6)
     if not same.any():
         raise InputError(
-            f"{recording.source} and the estimate have no stamp in common; give the recording that the estimate was made from"
+            f"{recording.source} and the estimate have no stamp in common; give the recording it was made from"
         )
     rows, q = places[same], estimate.attitude[same]
     imu[rows, 0:4] = q[:, [1, 2, 3, 0]]

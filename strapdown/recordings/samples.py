@@ -77,9 +77,16 @@ def read_samples(
         samples = samples_of(recording, sensor)
     if samples.values.shape[1] not in (1, 3):
         raise InputError(
-            f"{file.name} has {samples.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
+            f"{file.name} has {samples.values.shape[1]} columns; give one for each of the three axes, or for one axis"
         )
+    hertz, largest = 1.0 / samples.sample_interval, float(np.nanmax(np.abs(samples.values), initial=0.0))
+    if not (1.0 / LARGEST <= hertz <= LARGEST and largest <= LARGEST):
+        raise InputError(f"{file.name}: no {sensor} has {hertz:g} Hz and {largest:g}, SI; check its rate and its unit")
     return samples
+
+
+LARGEST = 1e12
+"""Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
 
 
 def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: str = "record") -> GyroSamples:
@@ -94,7 +101,7 @@ def samples_of(content: Recording | ImuRecord, sensor: str = "gyro", *, source: 
     kinds = {series.sensor: series.kind for series in content.vectors}
     if kinds.get(sensor, "vector") != "vector":
         raise InputError(
-            f'{source}: the {sensor} of the record measures a {kinds[sensor]}, without its magnitude; simulate it with kind = "vector"'
+            f'{source}: the {sensor} of the record measures a {kinds[sensor]}; simulate it with kind = "vector"'
         )
     return _of_recording(formats.from_record(content, source), sensor)
 

@@ -61,9 +61,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     file = Path(path)
     stamps, rows = _table(file, None, 10**9)
     if rows.shape[1] != 8:
-        raise InputError(
-            f"{file.name}: data row 1 has {rows.shape[1]} numbers; a TUM trajectory has time tx ty tz qx qy qz qw"
-        )
+        raise InputError(f"{file.name}: data row 1 has {rows.shape[1]} numbers, not time tx ty tz qx qy qz qw")
     norm = np.linalg.norm(rows[:, 4:], axis=1)
     if np.any(norm < 0.5):
         row = int(np.argmin(norm)) + 1

@@ -397,9 +397,7 @@ class Estimate(ByValue, Listed):
         """
         true_states = dict(true_values or {})
         if set(true_states) != set(self.error_states):
-            raise InputError(
-                f"true_values has {sorted(true_states)}, and the error states are {sorted(self.error_states)}; give each of them"
-            )
+            raise InputError(f"true_values has {sorted(true_states)}, wanted those of {sorted(self.error_states)}")
         turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
         parts = [turn, numbers("true_bias", true_bias, allow_nan=True) - self.bias]
         parts += [

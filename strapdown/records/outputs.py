@@ -72,7 +72,7 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
     repeated = any(a == b for a, b in itertools.pairwise(axes))
     if len(axes) != 3 or set(axes) - set("XYZ") or sequence not in (sequence.upper(), sequence.lower()) or repeated:
         raise InputError(
-            f"sequence is {sequence!r}; give three axes such as ZYX (body) or xyz (fixed), adjacent ones different"
+            f"sequence is {sequence!r}; give three axes such as ZYX (body) or xyz (fixed), neighbours different"
         )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # gimbal lock is reported by an infinite σ

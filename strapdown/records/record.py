@@ -235,7 +235,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     """Return the part of the record between two edges, with the measurements in (t_first, t_last], from edge 0 also those at that edge."""
     if not 0 <= first < last < len(record.time):
         raise InputError(
-            f"cut from edge {first} to {last} of a record with edges 0 to {len(record.time) - 1}; choose 0 ≤ first < last"
+            f"cut from edge {first} to {last} with edges 0 to {len(record.time) - 1}; choose 0 ≤ first < last"
         )
     t0, t1 = record.time[first], record.time[last]
     vectors = []

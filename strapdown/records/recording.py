@@ -106,8 +106,8 @@ class Recording(Listed):
         if np.max(np.abs(self.rate)) > LARGEST_RATE:
             row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(self.rate)), self.rate.shape))
             raise InputError(
-                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
-                "rad/s or deg/s by the scale factor of the datasheet, declare another unit (mrad/s), or remove the row"
+                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro "
+                "measures; convert raw counts by the datasheet, declare another unit, or remove the row"
             )
         for sensor in ("accelerometer", "magnetometer", "reference"):
             name = FIELDS[sensor]
@@ -119,9 +119,7 @@ class Recording(Listed):
                     object.__setattr__(self, "remarks", (*self.remarks, words))
                     value = None
                 elif sensor != "reference" and not np.any(np.abs(value) > 0.0):
-                    raise InputError(
-                        f"{self.source}: {name} is 0 in every row, as without a sensor; leave its columns out"
-                    )
+                    raise InputError(f"{self.source}: {name} is 0 in every row; leave its columns out")
                 object.__setattr__(self, name, value)
         if self.temperature is not None:
             value = array(f"{self.source}: temperature", self.temperature, (n,), allow_nan=True)
@@ -191,7 +189,7 @@ class Recording(Listed):
         if not same.all():
             missing = time[np.argmin(same)]
             raise InputError(
-                f"{self.source} has no stamp {missing:.6g} s, which the estimate has; give the recording that it was made from"
+                f"{self.source} has no stamp {missing:.6g} s, as the estimate has; give the recording it was made from"
             )
         return rows
 
@@ -246,7 +244,7 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
     if not known.all():
         if np.sum(known) < 2:
             raise InputError(
-                f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
+                f"{source}: {np.sum(known)} of {len(known)} rows have a whole gyro sample; at least 2 are needed"
             )
         stamps = increasing(f"{source}: time", columns["time"])
         moved = {}
