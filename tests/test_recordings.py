@@ -181,23 +181,15 @@ def test_bad_options_are_refused(csv, header, options, words):
     refused(csv(header), *words, **options)
 
 
-def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_used(csv, tmp_path):
-    path = csv("time,gx [rad/s],gy,gz,ax,ay,az")
-    refused(path, "unit of its accelerometer")
-    alone = read(path, gyro_alone=True)
-    np.testing.assert_array_equal(strapdown.read(path, gyro_alone=True).rate, alone.rate)
-    assert alone.specific_force is None
-    assert read(csv(), gyro_alone=True).specific_force is None
-    assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
+def test_options_of_samples_that_do_not_apply_are_refused(csv, tmp_path):
+    path = csv()
+    gyro = recordings.read_samples(path, "gyro")
+    np.testing.assert_array_equal(gyro.values, read(path).rate)
     with pytest.raises(InputError, match="states its own rate; drop the option rate"):
         recordings.read_samples(path, "gyro", rate=100.0)
-    np.save(tmp_path / "gyro.npy", alone.rate)
+    np.save(tmp_path / "gyro.npy", gyro.values)
     with pytest.raises(InputError, match=r"gyro.npy is one array; leave `topic='/imu'` out"):
         recordings.read_samples(tmp_path / "gyro.npy", units={"gyro": "rad/s"}, rate=100.0, topic="/imu")
-    status = CliRunner().invoke(
-        app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
-    )
-    assert status.exit_code == 0, status.output
 
 
 def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):

@@ -105,7 +105,7 @@ def integrate(
     ui.check_files(out, suffixes=ui.HDF5, own="strapdown estimate")
     rule = sd.coning.named(algorithm)
     with ui.progress_bar("reading, integrating, writing"):
-        source: Any = sd.read(recording, gyro_alone=True, **layout.options)
+        source: Any = sd.read(recording, **layout.options)
         with reading.from_file(recording):
             estimate = sd.integrate(source, rule)
         sd.write(estimate, out)

@@ -193,7 +193,7 @@ def _own(path: Path, kind: str) -> Attitudes:
 
 def _of_recording(path: Path) -> Attitudes:
     """Read the reference of a recording."""
-    recording = formats.read(path, gyro_alone=True)
+    recording = formats.read(path)
     if recording.true_attitude is None:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
     known = np.isfinite(recording.true_attitude).all(axis=1)

@@ -126,7 +126,6 @@ def recording(
     *,
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
 ) -> Recording:
     """Return the recording of a table with these names of columns.
 
@@ -144,8 +143,6 @@ def recording(
     if twice := [name for name, number in counts.items() if number > 1]:
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     roles, declared, remark = _roles(source, header, columns)
-    if gyro_alone:
-        roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
     _need_whole_groups(source, header, roles)
     unit_of_group = _units(source, {_group(role) for role in roles}, declared, units)
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__

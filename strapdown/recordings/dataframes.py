@@ -29,7 +29,6 @@ def from_table(
     source: str = "table",
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
 ) -> Recording:
     """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
@@ -59,7 +58,7 @@ def from_table(
         return x.astype(np.int64) if large else None
 
     load = lambda places, time: {k: values(k, time) for k in places}  # noqa: E731
-    return naming.recording(source, names, load, clock_ns, units=units, columns=columns, gyro_alone=gyro_alone)
+    return naming.recording(source, names, load, clock_ns, units=units, columns=columns)
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
@@ -134,7 +133,6 @@ def read_parquet(
     *,
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
 ) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
@@ -145,7 +143,7 @@ def read_parquet(
         flat = [k for k, column in enumerate(schema) if types.is_primitive(column.type) or types.is_null(column.type)]
         reading.need_room(file, 8.0 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
-    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns)
 
 
 def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:

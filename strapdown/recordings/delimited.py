@@ -21,7 +21,6 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +38,16 @@ def read_csv(
     *,
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
 ) -> Recording:
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
     left out and listed in ``missing_gyro``, their other samples moved to the nearest row; rows that repeat the row before are left out and
-    listed in ``repeated``. Options as for :func:`strapdown.read`; with ``gyro_alone`` the units of the other sensors are not needed.
+    listed in ``repeated``. Options as for :func:`strapdown.read`.
     """
     table = Table(file)
-    options: dict[str, Any] = {"units": units, "columns": columns, "gyro_alone": gyro_alone}
-    return naming.recording(file.name, table.header, table.load, lambda _, unit: table.clock_ns(unit), **options)
+    clock_ns = lambda _, unit: table.clock_ns(unit)  # noqa: E731
+    return naming.recording(file.name, table.header, table.load, clock_ns, units=units, columns=columns)
 
 
 class Table:

@@ -89,7 +89,7 @@ FORMATS: tuple[Format, ...] = (
         endings=(".parquet",),
         recognised=_starts(b"PAR1"),
         read=dataframes.read_parquet,
-        options=("units", "columns", "gyro_alone"),
+        options=("units", "columns"),
         write=dataframes.write_recording,
         write_estimate=dataframes.write_estimate,
         estimate_options=("sequence", "frame"),
@@ -126,7 +126,7 @@ FORMATS: tuple[Format, ...] = (
         endings=(".csv", ".tsv", ".txt"),
         recognised=lambda path, head: _text(head),
         read=delimited.read_csv,
-        options=("units", "columns", "gyro_alone"),
+        options=("units", "columns"),
         write=dataframes.write_recording,
         write_estimate=dataframes.write_estimate,
         estimate_options=("sequence", "frame"),
@@ -170,7 +170,6 @@ def read(
     path: str | os.PathLike[str],
     *,
     units: Mapping[str, str] | None = None,
-    gyro_alone: bool = False,
     columns: Mapping[str, str] | None = None,
     topic: str = "",
     axes: str | Mapping[str, str] | None = None,
@@ -183,7 +182,7 @@ def read(
         raise InputError(
             f"{file.name} is a {file_format.name}, which has no inertial samples; give it as the reference of a recording"
         )
-    options = {"units": units or {}, "columns": columns or {}, "topic": topic, "gyro_alone": gyro_alone}
+    options = {"units": units or {}, "columns": columns or {}, "topic": topic}
     for name, reason in _REASONS.items():
         if options[name] and name not in file_format.options:
             raise InputError(f"{file.name} ({file_format.name}): {reason} leave {Hint(name, options[name])} out")

@@ -73,7 +73,7 @@ def read_samples(
     elif simulated:
         samples = samples_of(recordfiles.read_record(file), sensor, source=file.name)
     else:
-        recording = formats.read(file, units=unit_of_sensor, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
+        recording = formats.read(file, units=unit_of_sensor, columns=columns, topic=topic)
         samples = samples_of(recording, sensor)
     if samples.values.shape[1] not in (1, 3):
         raise InputError(

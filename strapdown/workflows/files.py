@@ -37,7 +37,6 @@ def read(
     topic: str = "",
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
-    gyro_alone: bool = False,
 ) -> ImuRecord | Recording | Estimate | Campaign:
     """Read a file of any known format, identified by its content, or a table in memory.
 
@@ -59,8 +58,6 @@ def read(
         or those of single sensors, ``{"magnetometer": "y,x,-z"}``.
     invert : str or iterable of str, default empty
         For recordings: sensors with inverted sign, ``"accelerometer"`` for one that reads −g upward at rest.
-    gyro_alone : bool, default False
-        For recordings: whether to ignore the other sensors, whose units are then not needed, as :func:`integrate` does.
 
     Returns
     -------
@@ -82,14 +79,14 @@ def read(
     if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
         if topic:
             raise InputError(f"{Hint('topic')} is for a bag or a flight log; leave it out")
-        table = recordings.from_table(path, units=units, columns=columns, gyro_alone=gyro_alone)
+        table = recordings.from_table(path, units=units, columns=columns)
         return recordings.with_axes(table, axes, invert) if axes or invert else table
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
     kinds = {recordfiles.KIND: "a record", "strapdown estimate": "an estimate", "strapdown montecarlo": "a Monte Carlo"}
     kind = kinds.get(reading.kind(file), "")
     if not kind:
-        return recordings.read(file, gyro_alone=gyro_alone, **options)
+        return recordings.read(file, **options)
     for name, value in options.items():
         raise InputError(f"{file} is {kind} of this package and declares its own layout; leave {Hint(name, value)} out")
     if kind == "a record":
