@@ -35,15 +35,6 @@ def test_against_scipy():
     np.testing.assert_allclose(errors.heading, twist.magnitude(), atol=1e-7)
 
 
-def test_against_the_formulas_of_the_benchmark():
-    estimate, reference = random_pairs(seed=2)
-    errors = reference_errors(scalar_first(estimate), scalar_first(reference))
-    d = scalar_first(estimate * reference.inv())
-    np.testing.assert_allclose(errors.total, 2 * np.arccos(np.abs(d[:, 0])), atol=1e-7)
-    np.testing.assert_allclose(errors.heading, 2 * np.arctan(np.abs(d[:, 3] / d[:, 0])), atol=1e-12)
-    np.testing.assert_allclose(errors.inclination, 2 * np.arccos(np.sqrt(d[:, 0] ** 2 + d[:, 3] ** 2)), atol=1e-7)
-
-
 @pytest.mark.parametrize("angle", [1e-12, 1e-8, 1e-3, 0.5, 3.0])
 def test_pure_errors_of_any_size(angle):
     """A turn about the vertical is heading alone, one about a level axis inclination alone, to the last digits even when tiny."""
@@ -64,13 +55,6 @@ def test_errors_are_of_the_fixed_frame():
         scalar_first(lying * Rotation.from_rotvec([0.0, 0.0, 0.1]))[None], scalar_first(lying)[None]
     )
     np.testing.assert_allclose([errors.heading[0], errors.inclination[0]], [0.0, 0.1], atol=1e-15)
-
-
-def test_sign_of_the_quaternions_does_not_matter():
-    estimate, reference = (scalar_first(r) for r in random_pairs(20))
-    errors, other = reference_errors(estimate, reference), reference_errors(-estimate, reference)
-    for name in ("total", "heading", "inclination"):
-        np.testing.assert_array_equal(getattr(errors, name), getattr(other, name))
 
 
 def test_missing_references_give_nan_and_are_not_judged():
