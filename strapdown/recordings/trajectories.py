@@ -81,27 +81,23 @@ def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int
 
     Times are read as decimal numbers, because seconds since 1970 have more digits than a float.
     """
-    lines = reading.text(path).splitlines()
-    cells = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if not cells:
+    lines = [line for line in reading.text(path).splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
         raise InputError(f"{path.name} has no data rows")
-    rows: list[list[float]] = []
-    stamps: list[int] = []
-    for k, row in enumerate(cells):
-        place = f"{path.name}: data row {k + 1}"
-        try:
-            rows.append([float(x) for x in row])
-        except ValueError:
-            raise InputError(f"{place} is not numeric: {' '.join(row)[:60]!r}") from None
-        if len(row) != len(cells[0]):
-            raise InputError(f"{place} has {len(row)} fields, the first {len(cells[0])}; the file is truncated there")
-        stamp = Decimal(row[0])
-        if not stamp.is_finite() or abs(stamp) >= 2**63 // tick:
-            raise InputError(f"{place}: the time is {row[0]}, which no clock counts; remove the row")
-        stamps.append(int(stamp * tick))
-        if k and stamps[-1] <= stamps[-2]:
-            raise InputError(f"{place} is not after the one before; sort the rows")
-    return np.array(stamps, np.int64), np.array(rows)
+    with reading.from_file(path):
+        rows = np.loadtxt(lines, delimiter=separator, ndmin=2)
+    stamps = np.empty(len(lines), np.int64)
+    for k, line in enumerate(lines):
+        time = line.split(separator)[0].strip()
+        if not Decimal(time).is_finite() or abs(Decimal(time)) >= 2**63 // tick:
+            raise InputError(
+                f"{path.name}: data row {k + 1}: the time is {time}, which no clock counts; remove the row"
+            )
+        stamps[k] = int(Decimal(time) * tick)
+    back = np.diff(stamps) <= 0
+    if back.any():
+        raise InputError(f"{path.name}: data row {np.argmax(back) + 2} is not after the one before; sort the rows")
+    return stamps, rows
 
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
