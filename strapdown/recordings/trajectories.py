@@ -85,7 +85,7 @@ def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int
     if not lines:
         raise InputError(f"{path.name} has no data rows")
     with reading.from_file(path):
-        rows = np.loadtxt(lines, delimiter=separator, ndmin=2)
+        rows = np.array([[float(cell) for cell in line.split(separator)] for line in lines])
     stamps = np.empty(len(lines), np.int64)
     for k, line in enumerate(lines):
         time = line.split(separator)[0].strip()
