@@ -41,15 +41,6 @@ def refused(path, *words: str, **options) -> None:
 # ---------------------------------------------------------------------------------------------------- CSV: what is read
 
 
-def test_columns_are_read(csv):
-    recording = read(csv())
-    assert recording.source == "walk.csv"
-    np.testing.assert_array_equal(recording.time, [0.0, 0.01, 0.02])
-    np.testing.assert_array_equal(recording.rate, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
-    np.testing.assert_array_equal(recording.specific_force, [[1, 2, 9], [3, 4, 8], [5, 6, 7]])
-    assert recording.magnetic_field is recording.true_attitude is recording.movement is None
-
-
 def test_columns_in_any_order_with_others_between_comments_and_blank_lines(csv):
     header = "# logged by hand\n\n az [g], AY ,ax,temperature, mz,my,mx, gz [rad/s],gy,gx,Time"
     recording = read(

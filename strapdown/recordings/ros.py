@@ -198,10 +198,10 @@ def topics_of(path: Path, kinds: Collection[str] = ()) -> dict[str, Topic]:
     topics: dict[str, Topic] = {}
     try:
         with rosbag.Reader(path) as reader:
-            connections = [each for each in reader.connections if not kinds or each.msgtype in kinds]
-            for each in connections:
-                definition = each.msgdef.data if each.msgdef.format.name == "MSG" else ""
-                topics[each.topic] = Topic(each.topic, each.msgtype, ros2, definition)
+            connections = [c for c in reader.connections if not kinds or c.msgtype in kinds]
+            for c in connections:
+                definition = c.msgdef.data if c.msgdef.format.name == "MSG" else ""
+                topics[c.topic] = Topic(c.topic, c.msgtype, ros2, definition)
             for connection, logged, data in reader.messages(connections) if connections else ():
                 topics[connection.topic].logged.append(logged)
                 topics[connection.topic].raw.append(data)
