@@ -254,7 +254,7 @@ def _table(path: Path) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[rows],
-        attitude=_unit(path.name, q[rows]),
+        attitude=trajectories.unit_quaternions(path.name, q[rows]),
         covariance=covariance,
         error_frame=angles or frame,
         bias=bias,
@@ -326,14 +326,6 @@ def _covariance(
     return None, "", [words]
 
 
-def _unit(name: str, q: Array) -> Array:
-    length = np.linalg.norm(array(f"{name}: quaternion", q, ("m", 4)), axis=1)
-    bad = np.abs(length - 1.0) > 1e-2
-    if bad.any():
-        raise InputError(f"{name}: quaternion {int(np.argmax(bad)) + 1} has norm {length[np.argmax(bad)]:.4g}, not 1")
-    return quaternion.normalize(q)
-
-
 # -------------------------------------------------------------------------------------------------------------- bags
 
 
@@ -358,7 +350,7 @@ def _bag(path: Path, topic: str) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[fresh],
-        attitude=_unit(path.name, q[fresh]),
+        attitude=trajectories.unit_quaternions(path.name, q[fresh]),
         covariance=covariance,
         remarks=tuple(remarks),
     )
@@ -385,7 +377,9 @@ def _ulog(path: Path) -> Attitudes:
         raise InputError(f"{path.name} has neither {_STATES_TOPIC} nor {ulog.ATTITUDE}; log one of them")
     rows = data[topic]
     stamps, kept, _ = ulog.in_order(topic, rows.get("timestamp_sample", rows["timestamp"]))
-    ned = _unit(path.name, ulog.columns(rows, "q" if topic == ulog.ATTITUDE else "states", 4)[kept])
+    ned = trajectories.unit_quaternions(
+        path.name, ulog.columns(rows, "q" if topic == ulog.ATTITUDE else "states", 4)[kept]
+    )
     number = sum(name.startswith("covariances[") for name in rows)
     if topic == ulog.ATTITUDE:
         remarks.append(f"{ulog.ATTITUDE}: no covariance.")

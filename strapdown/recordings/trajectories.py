@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, array
 from strapdown.files import atomic_write, reading
 from strapdown.recordings.delimited import is_number, read_csv
 from strapdown.records import Estimate
@@ -62,11 +62,16 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     stamps, rows = _table(file, None, 10**9)
     if rows.shape[1] != 8:
         raise InputError(f"{file.name}: data row 1 has {rows.shape[1]} numbers, not time tx ty tz qx qy qz qw")
-    norm = np.linalg.norm(rows[:, 4:], axis=1)
-    if np.any(norm < 0.5):
-        row = int(np.argmin(norm)) + 1
-        raise InputError(f"{file.name}: data row {row} has a quaternion of norm below 0.5; it must be 1")
-    return stamps, quaternion.normalize(rows[:, [7, 4, 5, 6]])
+    return stamps, unit_quaternions(file.name, rows[:, [7, 4, 5, 6]])
+
+
+def unit_quaternions(name: str, q: Array) -> Array:
+    """Return the quaternions (m, 4) of a file, which may be rounded to two digits, with norm one."""
+    length = np.linalg.norm(array(f"{name}: quaternion", q, ("m", 4)), axis=1)
+    bad = np.abs(length - 1.0) > 1e-2
+    if bad.any():
+        raise InputError(f"{name}: quaternion {int(np.argmax(bad)) + 1} has norm {length[np.argmax(bad)]:.4g}, not 1")
+    return quaternion.normalize(q)
 
 
 def is_tum(head: bytes) -> bool:
