@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from gated_steps import GatedStepFilter
-from measured import correlation
+from measured import correlation, state_errors
 
 from strapdown import estimation
 from strapdown.estimation.states import covariance_matrices
@@ -100,7 +100,7 @@ def apart(whole, step):
     """Return how far the result of the compiled filter is from this one's, in σ, and its covariance in correlations: the largest."""
     P = whole.covariance if whole.whole_covariance is None else whole.whole_covariance
     sigma = np.sqrt(np.einsum("kii->ki", P))
-    off = np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma
+    off = np.abs(state_errors(whole, step.attitude, step.bias, step.values)) / sigma
     return max(np.max(off), np.max(np.abs(correlation(P - step.whole_covariance, sigma))))
 
 

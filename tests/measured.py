@@ -187,3 +187,12 @@ def walk(n=60, epoch=1_700_000_000_123_456_789, single=False) -> Recording:
         movement=random.random(n) > 0.5,
         epoch_ns=epoch // 1000 * 1000 if single else epoch,
     )
+
+
+def state_errors(estimate, true_attitude, true_bias, true_values=None) -> np.ndarray:
+    """Return the errors (m, n) of all states of an estimate: Log(q_est⁻¹ ⊗ q_true), then true less estimated."""
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(estimate.attitude), true_attitude))
+    true_values = true_values or {}
+    assert set(true_values) == set(estimate.error_states)
+    states = [true_values[name] - block.values for name, block in estimate.error_states.items()]
+    return np.concatenate([turn, true_bias - estimate.bias, *states], axis=-1)

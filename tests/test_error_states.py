@@ -22,6 +22,7 @@ from measured import (
     record_of,
     resting,
     series_of,
+    state_errors,
     turn_to,
     unit,
 )
@@ -551,7 +552,7 @@ def test_the_smoother_is_the_textbook_one(option):
     values = dict(
         zip(estimate.error_states, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True)
     )
-    assert np.max(np.abs(estimate.errors(q, b, values)) / sigma) < 1e-8
+    assert np.max(np.abs(state_errors(estimate, q, b, values)) / sigma) < 1e-8
     assert np.max(np.abs(correlation(estimate.whole_covariance - P, sigma))) < 1e-8
 
 

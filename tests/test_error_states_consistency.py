@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from measured import FIELD, HAND, beside_silent, drawn_start
+from measured import FIELD, HAND, beside_silent, drawn_start, state_errors
 
 from strapdown import consistency, estimation, gyro, quaternion
 from strapdown.estimation import error_states
@@ -127,7 +127,7 @@ def judged(
         if DRIFT.name in run.truth and any(block.name == DRIFT.name for block in blocks):
             true_bias = true_bias - run.truth[DRIFT.name]
         truth = {block.name: run.truth[block.name] for block in blocks}
-        error = estimate.errors(run.record.truth.attitude, true_bias, truth)[epochs]
+        error = state_errors(estimate, run.record.truth.attitude, true_bias, truth)[epochs]
         P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         for name, part in parts.items():
             values[name].append(consistency.nees(error[:, part], P[:, part][:, :, part]))

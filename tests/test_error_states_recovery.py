@@ -19,6 +19,7 @@ from measured import (
     recoveries,
     sample,
     series_of,
+    state_errors,
     unit,
 )
 
@@ -146,7 +147,7 @@ def judged(case: str, runs: int, make: Callable[[int], Trial], after, since: flo
         if not recovered[-1]:
             continue
         values = {block.name: np.zeros(3) if block is SWAY else trial.truth[block.name] for block in blocks}
-        error = estimate.errors(trial.record.truth.attitude, trial.record.truth.bias, values)
+        error = state_errors(estimate, trial.record.truth.attitude, trial.record.truth.bias, values)
         last = 6 + sum(block.size for block in blocks if block is not SWAY)  # which comes last
         rows = np.searchsorted(estimate.time, recovered[-1][0].end + np.asarray(after) - 1e-9)
         parts = slice(0, 3), slice(3, 6), slice(6, last)

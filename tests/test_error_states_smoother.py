@@ -15,6 +15,7 @@ from measured import (
     recoveries,
     resting,
     series_of,
+    state_errors,
     turn_to,
     unit,
 )
@@ -419,8 +420,8 @@ def test_what_is_smoothed_of_a_recovery_and_what_is_not():
     first, last = np.searchsorted(record.time, [event.start, event.end])
     assert last - first > 10
     truth = record.truth.attitude, record.truth.bias, {"mag bias": iron}
-    off = np.abs(both.errors(*truth)) / np.sqrt(np.einsum("kii->ki", both.whole_covariance))
-    wrong = np.abs(ahead.errors(*truth)) / np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
+    off = np.abs(state_errors(both, *truth)) / np.sqrt(np.einsum("kii->ki", both.whole_covariance))
+    wrong = np.abs(state_errors(ahead, *truth)) / np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
     assert np.min(np.max(wrong[first:last], axis=1)) > 10.0  # what the filter said in between is wrong
     assert np.max(off[first:]) < 5.0
     assert np.all(both.sigma[last:] <= ahead.sigma[last:] * (1.0 + 1e-2))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from measured import UP, assert_inside, drawn_start, in_body, series_of, unit, waves
+from measured import UP, assert_inside, drawn_start, in_body, series_of, state_errors, unit, waves
 
 from benchmarks import recordings as leaderboard
 from sims import hand_held
@@ -427,7 +427,7 @@ def judged(
         estimate = face(record, NOISE, initial, (block,), full_covariance=True)
         epochs = (np.linspace(0.5, 0.97, 5) * (len(record.time) - 1)).astype(int)
         states = _as_estimated(truth["states"], truth["attitude"], estimate.attitude)
-        e = estimate.errors(truth["attitude"], truth["bias"], {block.name: states})[epochs]
+        e = state_errors(estimate, truth["attitude"], truth["bias"], {block.name: states})[epochs]
         P = estimate.whole_covariance[epochs]
         for name, part in parts.items():
             statistics[name].append(consistency.nees(e[:, part], P[:, part, part]) / e[:, part].shape[1])

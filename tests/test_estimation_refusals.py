@@ -207,7 +207,6 @@ TABLE = [
         "initial has 3 error states",
     ),
     (run, {"every": 0}, "every is 0"),
-    (lambda: run().errors(np.zeros(4), np.zeros(3), {"x": 1.0}), {}, "true_values"),
     (lambda: estimation.observability(RECORD, NOISE, start(), threshold=0.0), {}, "threshold is 0"),
     (lambda: estimation.with_error_states(start(), MAG_BIAS), {}, "give a tuple"),
     (lambda: replace(RECORD, vectors=SERIES), {}, "(series,)"),

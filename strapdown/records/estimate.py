@@ -375,37 +375,6 @@ class Estimate(ByValue, Listed):
         """Whether σ of the attitude is known."""
         return bool(np.isfinite(self.variance[:, :3]).any())
 
-    def errors(
-        self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
-    ) -> Array:
-        """Return the error of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
-
-        Parameters
-        ----------
-        true_attitude : array_like (m, 4)
-            True q_fb at the times of the estimate.
-        true_bias : array_like (m, 3)
-            True gyro bias, rad/s, body axes.
-        true_values : mapping of str to array_like (size,) or (m, size), optional
-            True error states by name, in the axes of the estimated attitude for those with
-            :attr:`strapdown.estimation.error_states.Effect.carried`. Required for a filter with error states.
-
-        Returns
-        -------
-        ndarray (m, n)
-            δθ, rad, body axes; δb, rad/s; error states in their units.
-        """
-        true_states = dict(true_values or {})
-        if set(true_states) != set(self.error_states):
-            raise InputError(f"true_values has {sorted(true_states)}, wanted those of {sorted(self.error_states)}")
-        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
-        parts = [turn, numbers("true_bias", true_bias, allow_nan=True) - self.bias]
-        parts += [
-            numbers(f"true_values: {name}", true_states[name]) - states.values
-            for name, states in self.error_states.items()
-        ]
-        return np.concatenate(parts, axis=-1)
-
     @property
     def refused(self) -> dict[str, int]:
         """Number of measurements rejected by a gate, by sensor."""
