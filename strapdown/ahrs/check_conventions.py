@@ -210,10 +210,12 @@ class ConventionWarning(UserWarning):
     """Axes, signs or units of a recording seem wrong."""
 
 
-def warn(source: Recording) -> None:
-    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
-    for words in examine(source).warnings:
+def warn(source: Recording) -> bool:
+    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong; return whether they do."""
+    sentences = examine(source).warnings
+    for words in sentences:
         warnings.warn(f"{source.source}: {words}", ConventionWarning, stacklevel=3)
+    return len(sentences) > 0
 
 
 def examine(recording: Recording) -> Examination:

@@ -123,10 +123,9 @@ def estimate(
     >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
     """
     options = locals()
-    if isinstance(source, Recording):
-        ahrs.check_conventions.warn(source)
+    doubtful = isinstance(source, Recording) and ahrs.check_conventions.warn(source)
     result = run(**options)
-    if result.recorded is not None:
+    if result.recorded is not None and not doubtful:  # wrong axes are the cause then
         warn(result.recorded, result.estimate.motion)
     return result.estimate
 
@@ -181,10 +180,9 @@ def smooth(
     (30001, 4)
     """
     options = locals()
-    if isinstance(source, Recording):
-        ahrs.check_conventions.warn(source)
+    doubtful = isinstance(source, Recording) and ahrs.check_conventions.warn(source)
     result = run(**options, smooth=True)
-    if result.recorded is not None:
+    if result.recorded is not None and not doubtful:  # wrong axes are the cause then
         warn(result.recorded, result.estimate.motion)
     return result.estimate
 
