@@ -144,7 +144,7 @@ def exact_step(table: Algorithm, window: Sequence[Vector]) -> Vector:
         others = combination(lags, [window[-1 - lag] for lag in range(1, len(lags) + 1)])
         return exponential(combination([1, 1], [whole, cross(others, window[-1])]))
     if table.solver == "pairs":
-        return exponential(combination([1, 1], [whole, pair_sum(table.pairs, window)]))
+        return exponential(combination([1, 1], [whole, pair_sum(table.products, window)]))
     if table.solver == "euler":
         return unit((mp.mpf(1), *(x / 2 for x in whole)))
     powers = rate_powers(window, p)

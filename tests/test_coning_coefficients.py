@@ -8,7 +8,7 @@ import pytest
 
 from strapdown import coning
 from strapdown.checks import InputError
-from strapdown.coning import ALGORITHMS, Algorithm
+from strapdown.coning import ALGORITHMS
 from strapdown.coning import coefficients as exact
 
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
@@ -82,7 +82,7 @@ def test_drift_constant_is_the_closed_form(n, p):
     ],
 )
 def test_published_time_taylor_coefficients(n, denominator, published):
-    table = ALGORITHMS[f"time-taylor-{n}"].pairs
+    table = ALGORITHMS[f"time-taylor-{n}"].products
     assert {pair: table[pair[0]][pair[1]] for pair in published} == {
         k: Fraction(v, denominator) for k, v in published.items()
     }
@@ -123,26 +123,24 @@ def test_matched_correction(n, p, f):
 
 
 @pytest.mark.parametrize("window", [1, 2, 3, 5, 9])
-def test_interval_rates_reproduce_their_increments(window):
-    for interval in range(window):
-        rows = exact.interval_rates(window, interval)
-        for j, powers in enumerate(rows):
-            for i in range(window):  # integral over interval i, seen from the middle of `interval`
-                low, high = Fraction(2 * (i - interval) - 1, 2), Fraction(2 * (i - interval) + 1, 2)
+def test_rates_reproduce_their_increments_about_any_origin(window):
+    for origin in (Fraction(k, 2) for k in range(2 * window + 1)):
+        for j, powers in enumerate(exact.rates_about(window, origin)):
+            for i in range(window):
+                low, high = i - origin, i + 1 - origin
                 integral = sum(c * (high ** (k + 1) - low ** (k + 1)) / (k + 1) for k, c in enumerate(powers))
                 assert integral == (1 if i == j else 0)
 
 
-def test_step_moments_and_rates_of_known_polynomials():
-    # w = t² over a step of 3 samples: T⁻¹ ∫ (t − 3/2) t² dt = 27/8·… by hand: (81/4 − 27/2)/3 = 9/4.
+def test_weights_of_schemes_on_a_known_polynomial():
+    """w = t² over a step of 3 samples: T⁻¹ ∫ (t − 3/2) t² dt = (81/4 − 27/2)/3 = 9/4."""
     increments = monomial_increments(2, 0, 3)
-    moments = [sum(w * x for w, x in zip(row, increments, strict=True)) for row in exact.step_moments(3, 2)]
-    assert moments == [9, Fraction(9, 4)]
-    rates = [
-        sum(w * x for w, x in zip(row, increments, strict=True))
-        for row in exact.step_rates_at(3, (Fraction(0), Fraction(3, 2), Fraction(3)))
-    ]
-    assert rates == [0, Fraction(27, 4), 27]
+
+    def weighted(solver):
+        return [sum(w * x for w, x in zip(row, increments, strict=True)) for row in exact.scheme_weights(solver, 3)]
+
+    assert weighted("magnus-6")[:2] == [9, Fraction(9, 4)]
+    assert weighted("runge-kutta-4") == [0, Fraction(27, 4), 27]
 
 
 @pytest.mark.parametrize("points", [2, 4, 6, 8])
@@ -172,31 +170,32 @@ def test_the_drift_orders_of_the_catalogue():
 
 @pytest.mark.parametrize("name", ["four-sample", "time-taylor-3", "matched-2-8", "four-sample-rate-2"])
 def test_one_wrong_coefficient_shows_in_the_drift_order(name):
-    good = ALGORITHMS[name]
-    if good.solver == "compressed":
-        bad = {"coefficients": (good.coefficients[0] + Fraction(1, 1000), *good.coefficients[1:])}
-    else:
-        what = "correction" if good.solver == "polynomial" else "pairs"
-        rows = [list(row) for row in getattr(good, what)]
-        rows[0][1] += Fraction(1, 1000)
-        rows[1][0] -= Fraction(1, 1000)
-        bad = {what: tuple(map(tuple, rows))}
-    assert dataclasses.replace(good, **bad).drift_order < good.drift_order
+    good, m = ALGORITHMS[name], ALGORITHMS[name].window
+    rows = [list(row) for row in good.products]
+    rows[m - 2][m - 1] += Fraction(1, 1000)
+    rows[m - 1][m - 2] -= Fraction(1, 1000)
+    assert dataclasses.replace(good, products=tuple(map(tuple, rows))).drift_order < good.drift_order
+
+
+ZERO, TAYLOR = Fraction(0), ALGORITHMS["time-taylor-3"].products
 
 
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
-        ("time-taylor-3", {"pairs": ((Fraction(1),) * 3,) * 3}, "antisymmetric"),
-        ("time-taylor-3", {"pairs": ALGORITHMS["time-taylor-3"].pairs[:2]}, "3 by 3"),
-        ("two-sample", {"coefficients": ()}, "coefficients"),
-        ("two-sample", {"coefficients": (2.0 / 3.0,)}, "not rational"),
-        ("polynomial-4", {"correction": ((Fraction(0),) * 5,) * 5}, "correction is not 4 by 4"),
-        ("polynomial-4", {"correction": ()}, "correction is not 4 by 4"),
+        ("time-taylor-3", {"products": ((Fraction(1),) * 3,) * 3}, "antisymmetric"),
+        ("time-taylor-3", {"products": TAYLOR[:2]}, "3 by 3"),
+        ("time-taylor-3", {"solver": "compressed"}, "with the last increment of the step only"),
+        ("two-sample", {"products": ((0.0, 2.0 / 3.0), (-2.0 / 3.0, 0.0))}, "not rational"),
+        ("one-sample", {"following": 1, "products": ((ZERO,) * 2,) * 2}, "with the last increment of the step only"),
+        ("polynomial-4", {"products": ((ZERO,) * 5,) * 5}, "products is not 4 by 4"),
         ("one-sample-rate-2", {"rate_points": 3}, "rate_points is 3; it must be even"),
+        # Or the algorithm would not be what its table says, and its drift order that of something else.
+        ("runge-kutta-4", {"products": TAYLOR}, "by its increments alone"),
+        ("quaternion-euler", {"previous": 2, "products": ((ZERO,) * 3,) * 3}, "by its increments alone"),
     ],
 )
-def test_tables_of_other_shapes_and_numbers_are_refused(name, change, words):
+def test_tables_that_are_not_those_of_the_solver_are_refused(name, change, words):
     with pytest.raises(InputError, match=words):
         dataclasses.replace(ALGORITHMS[name], **change)
 
@@ -210,33 +209,6 @@ def test_catalogue_names_are_the_algorithms_names():
         coning.named("two-samples")
 
 
-def test_what_a_solver_does_not_use_is_refused():
-    """Or the algorithm would not be what its table says, and the order check would be of something else."""
-    third = Fraction(1, 3)
-    with pytest.raises(InputError, match="uses no increments after the step"):
-        Algorithm(name="mine", solver="compressed", samples=1, following=1, order=3, coefficients=(third,))
-    pairs = ((Fraction(0), Fraction(2, 3)), (Fraction(-2, 3), Fraction(0)))
-    for solver in ("euler", "magnus-6", "runge-kutta-4", "polynomial", "compressed"):
-        with pytest.raises(InputError, match=f"mine: solver '{solver}' does not use pairs"):
-            Algorithm(
-                name="mine",
-                solver=solver,
-                samples=2,
-                order=2,
-                pairs=pairs,
-                coefficients=(Fraction(2, 3),) if solver == "compressed" else (),
-                correction=((Fraction(0),) * 2,) * 2 if solver == "polynomial" else (),
-            )
-    with pytest.raises(InputError, match="does not use coefficients"):
-        dataclasses.replace(ALGORITHMS["time-taylor-2"], coefficients=(Fraction(2, 3),))
-    for solver in ("euler", "runge-kutta-4", "magnus-6"):
-        for around in ({"previous": 1}, {"following": 2}):
-            with pytest.raises(InputError, match="previous and following must be 0"):
-                Algorithm(name="mine", solver=solver, samples=3, order=2, **around)
-    # Two increments summed, and then Euler's step: no products of two.
-    assert Algorithm(name="mine", solver="euler", samples=2, order=2).drift_order == 2
-
-
 def test_products_of_the_published_schemes():
     """Of a rate a + b t they make T³/12 a × b: ½ ∫ (A b − B a) dt, all that there is to second order."""
     table = ALGORITHMS["magnus-6"].products
@@ -245,3 +217,5 @@ def test_products_of_the_published_schemes():
     got = sum(table[i][j] * (ones[i] * ramp[j] - ones[j] * ramp[i]) for i in range(n) for j in range(i + 1, n))
     assert got == second_order(0, 1, n)
     assert ALGORITHMS["two-sample"].products == ((0, Fraction(2, 3)), (Fraction(-2, 3), 0))
+    # Two increments summed, and then Euler's step: no products of two.
+    assert coning.algorithms.scheme("mine", "euler", 2, 2, "").drift_order == 2

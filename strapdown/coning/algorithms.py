@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import operator
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,9 +31,6 @@ SOLVERS = {
 
 Coefficient = int | float | str | Fraction
 """Types of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
-
-_TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
-"""The table that a solver uses. The other solvers use none, and only the increments of the step."""
 
 
 def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
@@ -66,12 +64,10 @@ class Algorithm:
         Number of rate samples in the quadrature of one increment; 0 if the algorithm uses true increments.
     order : int
         Global order of convergence for any smooth motion and exact increments.
-    coefficients : tuple of Fraction, default empty
-        For the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N.
-    pairs : tuple of tuples of Fraction, default empty
-        For the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``).
-    correction : tuple of tuples of Fraction, default empty
-        For the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none.
+    products : tuple of tuples of Fraction
+        Coefficients K_ij of all products Δθ_i × Δθ_j, i < j, in a step, over the window: a pair table (see ``coefficients``). The pairs
+        solver computes φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, the compressed one also, from products with the last increment only. The
+        polynomial solver adds to its solution what K exceeds that solution's own products by. Those of the other solvers are their own.
     source : str, default ""
         Publication.
     """
@@ -83,53 +79,33 @@ class Algorithm:
     following: int = 0
     rate_points: int = 0
     order: int
-    coefficients: Rationals = field(default=(), repr=False)
-    pairs: Table = field(default=(), repr=False)
-    correction: Table = field(default=(), repr=False)
+    products: Table = field(repr=False)
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Check shapes and solver."""
+        """Check sizes, solver and products."""
         checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
-        for what in ("samples", "order"):
-            checks.count(f"{self.name}: {what}", getattr(self, what))
-        for what in ("previous", "following", "rate_points"):
-            checks.count(f"{self.name}: {what}", getattr(self, what), minimum=0)
+        for what, minimum in (("samples", 1), ("order", 1), ("previous", 0), ("following", 0), ("rate_points", 0)):
+            checks.count(f"{self.name}: {what}", getattr(self, what), minimum=minimum)
         if self.rate_points % 2:
             raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
-        if self.solver == "compressed" and self.following:
+        m, table = self.window, self.products
+        if len(table) != m or any(len(row) != m for row in table):
+            raise InputError(f"{self.name}: products is not {m} by {m}, one row for each increment of the window")
+        if not all(isinstance(x, Rational) for row in table for x in row):
             raise InputError(
-                f"{self.name}: following is {self.following}, but the compressed solver uses no increments after the step; "
-                "use solver 'pairs'"
+                f"{self.name}: products has a number that is not rational; give fractions.Fraction or int, since orders are derived exactly"
             )
-        if self.solver not in _TABLES and self.window != self.samples:
+        if any(table[i][j] != -table[j][i] for i in range(m) for j in range(i + 1)):
+            raise InputError(f"{self.name}: products is not antisymmetric; Δθ_i × Δθ_j changes sign with its order")
+        if self.solver == "compressed" and (self.following or any(any(row[:-1]) for row in table[:-1])):
             raise InputError(
-                f"{self.name}: solver {self.solver!r} uses only the increments of the step; previous and following must be 0"
+                f"{self.name}: the compressed solver uses products with the last increment of the step only; use solver 'pairs'"
             )
-        m = self.window
-        own = _TABLES.get(self.solver)
-        for what in _TABLES.values():
-            if what != own and getattr(self, what):
-                raise InputError(f"{self.name}: solver {self.solver!r} does not use {what}; leave the table out")
-        if own is None:
-            return
-        table = getattr(self, own)
-        entries = table if own == "coefficients" else [x for row in table for x in row]
-        if not all(isinstance(x, Rational) for x in entries):
-            raise InputError(
-                f"{self.name}: {own} has a number that is not rational; give fractions.Fraction or int, since orders are derived exactly"
-            )
-        if own == "coefficients":
-            if len(table) != m - 1:
-                raise InputError(f"{self.name}: {len(table)} coefficients; N − 1 + p = {m - 1} are needed")
-        elif len(table) != m or any(len(row) != m for row in table):
-            raise InputError(
-                f"{self.name}: the table {own} is not {m} by {m}, one row for each increment of the window"
-            )
-        elif any(table[i][j] != -table[j][i] for i in range(m) for j in range(i + 1)):
-            raise InputError(
-                f"{self.name}: the table {own} is not antisymmetric; Δθ_i × Δθ_j changes sign with its order"
-            )
+        if self.solver not in ("compressed", "pairs", "polynomial") and table != exact.scheme_products(
+            self.solver, self.samples
+        ):
+            raise InputError(f"{self.name}: the products of solver {self.solver!r} are given by its increments alone")
 
     @classmethod
     def from_coefficients(
@@ -167,14 +143,13 @@ class Algorithm:
             raise InputError(
                 f"{name}: {len(rationals)} coefficients with previous {previous} leave no increment in the step; give at least {previous}"
             )
-        own = tuple(reversed(rationals))
-        table = exact.outer_pairs((*rationals, Fraction(0)), (*[Fraction(0)] * len(rationals), Fraction(1)))
+        table = _with_last(rationals)
         return cls(
             name=name,
             solver="compressed",
             samples=samples,
             previous=previous,
-            coefficients=own,
+            products=table,
             source=source,
             order=exact.second_order(table, samples, previous),
         )
@@ -230,14 +205,14 @@ class Algorithm:
             (value,) = _rationals(place, entry[2:])
             table[i - 1][j - 1] += value
             table[j - 1][i - 1] -= value
-        pairs = tuple(tuple(row) for row in table)
+        pairs = tuple(map(tuple, table))
         return cls(
             name=name,
             solver="pairs",
             samples=samples,
             previous=previous,
             following=following,
-            pairs=pairs,
+            products=pairs,
             source=source,
             order=exact.second_order(pairs, samples, previous),
         )
@@ -267,23 +242,21 @@ class Algorithm:
             raise InputError(
                 f"{place}: give either coefficients, [c_1, …] of (Σ c_i Δθ_i) × Δθ_M, or products, [[i, j, K], …] of K Δθ_i × Δθ_j"
             )
-        entries = table.get("coefficients", table.get("products"))
+        rest = dict(table)
+        form = "products" if "products" in rest else "coefficients"
+        entries = rest.pop(form)
         if not isinstance(entries, list):
             raise InputError(f"{place}: {entries!r} is no list; write numbers, or fractions in quotes, in brackets")
-        rest = {key: value for key, value in table.items() if key not in ("coefficients", "products")}
-        if "products" in table:
+        if form == "products":
             if "samples" not in rest:
                 raise InputError(f"{place}: samples is missing; give the number of increments in a step")
             return cls.from_products(products=entries, **rest)
-        wanted, late = rest.pop("samples", None), rest.pop("following", 0)
+        samples, following = rest.pop("samples", None), rest.pop("following", 0)
         algorithm = cls.from_coefficients(coefficients=entries, **rest)
-        if wanted is not None and wanted != algorithm.samples:
+        if following or samples not in (None, algorithm.samples):
             raise InputError(
-                f"{place}: samples is {wanted}, but {len(entries)} coefficients and previous {algorithm.previous} need {algorithm.samples}"
-            )
-        if late:
-            raise InputError(
-                f"{place}: following is {late}, but coefficients use no increments after the step; give products"
+                f"{place}: {len(entries)} coefficients and previous {algorithm.previous} need samples {algorithm.samples} and following 0; "
+                "for another step give products"
             )
         return algorithm
 
@@ -296,21 +269,14 @@ class Algorithm:
             Table; exists for rotation-vector algorithms only.
         """
         table: dict[str, Any] = {"name": self.name, "samples": self.samples}
-        if self.previous:
-            table["previous"] = self.previous
-        if self.following:
-            table["following"] = self.following
+        table |= {name: getattr(self, name) for name in ("previous", "following", "source") if getattr(self, name)}
         if self.solver == "compressed" and not self.rate_points:
             table["coefficients"] = [str(k) for k in reversed(self.coefficients)]
         elif self.solver == "pairs":
-            m = self.window
-            table["products"] = [
-                [i + 1, j + 1, str(self.pairs[i][j])] for i in range(m) for j in range(i + 1, m) if self.pairs[i][j]
-            ]
+            rows = enumerate(self.products, start=1)
+            table["products"] = [[i, j, str(k)] for i, row in rows for j, k in enumerate(row, start=1) if k and i < j]
         else:
             raise InputError(f"{self.name}: an algorithm with solver {self.solver!r} has no table; write its name")
-        if self.source:
-            table["source"] = self.source
         return table
 
     @property
@@ -325,18 +291,16 @@ class Algorithm:
             return f"rates ({self.rate_points}-point quadrature)"
         return "increments" + (f", {self.following} samples late" if self.following else "")
 
-    @functools.cached_property
-    def products(self) -> Table:
-        """Coefficients of all products of two increments in a step, as a pair table over the window."""
-        n, m = self.samples, self.window
-        if self.solver == "compressed":
-            before = [*reversed(self.coefficients), Fraction(0)]
-            return exact.outer_pairs(tuple(before), (*[Fraction(0)] * (m - 1), Fraction(1)))
-        if self.solver == "pairs":
-            return self.pairs
-        if self.solver == "polynomial":
-            return exact.sum_of_tables(exact.taylor_pairs(n, self.previous, self.following), self.correction)
-        return _scheme_products(self.solver, n)
+    @property
+    def coefficients(self) -> Rationals:
+        """For the compressed solver: k_1 … k_{M−1} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N."""
+        return tuple(row[-1] for row in reversed(self.products[:-1]))
+
+    @property
+    def correction(self) -> Table:
+        """For the polynomial solver: what ``products`` exceeds the products of its solution by."""
+        own = exact.taylor_pairs(self.samples, self.previous, self.following)
+        return tuple(tuple(map(operator.sub, *rows)) for rows in zip(self.products, own, strict=True))
 
     @functools.cached_property
     def lags(self) -> Rationals:
@@ -368,8 +332,8 @@ class Algorithm:
 
     @functools.cached_property
     def pair_arrays(self) -> Array:
-        """``pairs`` as floats, by the place of the step in the window (M − N + 1, M, M), as :func:`pair_tables` gives them."""
-        return pair_tables(self.samples, self.window, {self.previous: self.pairs})
+        """``products`` as floats, by the place of the step in the window (M − N + 1, M, M), as :func:`pair_tables` gives them."""
+        return pair_tables(self.samples, self.window, {self.previous: self.products})
 
     @functools.cached_property
     def correction_array(self) -> Array:
@@ -384,6 +348,11 @@ class Algorithm:
     def drift_series(self) -> tuple[float, ...]:
         """Coefficients of λ⁰, λ², λ⁴, … of the drift divided by β²ω, enough for λ ≤ 1 and a window of 17."""
         return tuple(float(c) for c in self._drift_series(48))
+
+
+def _with_last(coefficients: Rationals) -> Table:
+    """Return the pair table of (Σ c_i Δθ_i) × Δθ_M, c_1 … c_{M−1}."""
+    return exact.outer_pairs((*coefficients, Fraction(0)), (*[Fraction(0)] * len(coefficients), Fraction(1)))
 
 
 def _rationals(place: str, values: Iterable[Coefficient]) -> Rationals:
@@ -432,21 +401,6 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
     return algorithms
 
 
-def _scheme_products(solver: str, samples: int) -> Table:
-    """Return the pair table of a one-step scheme that uses moments B_n or rates w."""
-    if solver == "euler":
-        return ((Fraction(0),) * samples,) * samples
-    if solver == "runge-kutta-4":
-        # Twice the vector part of the step quaternion has the products T²/12 (w₀ × w_½ + w_½ × w₁).
-        w = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
-        both = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
-        return tuple(tuple(x / 12 for x in row) for row in both)
-    # magnus-6: α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
-    b = exact.step_moments(samples, 3)
-    left = tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True))
-    return exact.outer_pairs(left, tuple(12 * y for y in b[1]))
-
-
 # ------------------------------------------------------------------------------------------------------------------- makers
 
 
@@ -468,27 +422,22 @@ def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorit
         # One lag-symmetric cross product is optimal for coning. For general motion it is exact for linear rates only; two samples gain an
         # order by symmetry.
         order=2 if m == 1 or rate_points == 2 else 4 if (samples, previous) == (2, 0) else 3,
-        coefficients=table,
+        products=_with_last(tuple(reversed(table))),
         source="this package, from rate samples" if rate_points else "Miller 1983; Ignagni 1996; Savage 2010",
     )
 
 
-def uncompressed(name: str, samples: int, pairs: Table, source: str) -> Algorithm:
-    """Return a rotation-vector algorithm with all cross products."""
-    return Algorithm(name=name, solver="pairs", samples=samples, order=4, pairs=pairs, source=source)
+def uncompressed(family: str, samples: int) -> Algorithm:
+    """Return the rotation-vector algorithm that is exact, to second order, for a rate polynomial of degree N − 1 (``"time-taylor"``).
 
-
-def time_taylor(samples: int) -> Algorithm:
-    """Return the rotation-vector algorithm exact, to second order, for a rate polynomial of degree N − 1."""
-    pairs = exact.taylor_pairs(samples)
-    return uncompressed(f"time-taylor-{samples}", samples, pairs, "Jordan 1969; Savage 1998; Song 2013")
-
-
-def uncompressed_optimal(samples: int) -> Algorithm:
-    """Return the uncompressed algorithm that is optimal under coning and otherwise closest to the time-Taylor algorithm."""
-    pairs = exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples))
-    source = "Song 2013, with the free coefficients of matched_correction"
-    return uncompressed(f"uncompressed-{samples}", samples, pairs, source)
+    Or the one that is optimal under coning and otherwise closest to it (``"uncompressed"``).
+    """
+    pairs, source = exact.taylor_pairs(samples), "Jordan 1969; Savage 1998; Song 2013"
+    if family == "uncompressed":
+        pairs = exact.sum_of_tables(pairs, exact.matched_correction(samples))
+        source = "Song 2013, with the free coefficients of matched_correction"
+    name = f"{family}-{samples}"
+    return Algorithm(name=name, solver="pairs", samples=samples, order=4, products=pairs, source=source)
 
 
 def polynomial(samples: int) -> Algorithm:
@@ -498,14 +447,15 @@ def polynomial(samples: int) -> Algorithm:
         solver="polynomial",
         samples=samples,
         order=_fitted_order(samples),
-        correction=((Fraction(0),) * samples,) * samples,
+        products=exact.taylor_pairs(samples),
         source="Wu 2018 (RodFIter, QuatFIter); Yan 2017 (Picard)",
     )
 
 
 def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
     """Return an algorithm derived for this package, see :func:`strapdown.coning.coefficients.matched_correction`."""
-    m = samples + previous + following
+    window = samples, previous, following
+    m = sum(window)
     return Algorithm(
         name=f"matched-{samples}-{previous}" + (f"-{following}" if following else ""),
         solver="polynomial",
@@ -513,20 +463,15 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
         previous=previous,
         following=following,
         order=_fitted_order(m) if previous == following else m + 1,
-        correction=exact.matched_correction(samples, previous, following),
+        products=exact.sum_of_tables(exact.taylor_pairs(*window), exact.matched_correction(*window)),
         source="this package",
     )
 
 
-_SCHEMES: dict[str, dict[str, Any]] = {
-    # From moments of the polynomial.
-    "magnus-6": {"solver": "magnus-6", "samples": 4, "order": 6, "source": "Blanes, Casas, Ros 2000"},
-    # From equation (17), with rates at 0, T/2, T.
-    "runge-kutta-4": {"solver": "runge-kutta-4", "samples": 3, "order": 4, "source": "Kutta 1901"},
-    # q + ½ q ⊗ Δθ, normalised, as in many small projects.
-    "quaternion-euler": {"solver": "euler", "samples": 1, "order": 2, "source": "Euler 1768"},
-}
-"""Integrators of the quaternion equation for smooth rates, on the rate polynomial through the increments of a step."""
+def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Algorithm:
+    """Return an integrator of the quaternion equation for smooth rates, on the rate polynomial through the increments of a step."""
+    products = exact.scheme_products(solver, samples)
+    return Algorithm(name=name, solver=solver, samples=samples, order=order, products=products, source=source)
 
 
 def _fitted_order(samples: int) -> int:
@@ -567,14 +512,18 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
     for p in range(4):
         for n, number in enumerate(_NUMBERS, start=1):
             makers[f"{number}-sample" + (f"-previous-{p}" if p else "")] = functools.partial(compressed, n, p)
-    for n in range(2, 7):
-        makers[f"time-taylor-{n}"] = functools.partial(time_taylor, n)
-    for n in range(2, 7):
-        makers[f"uncompressed-{n}"] = functools.partial(uncompressed_optimal, n)
+    for family in ("time-taylor", "uncompressed"):
+        for n in range(2, 7):
+            makers[f"{family}-{n}"] = functools.partial(uncompressed, family, n)
     for n in range(2, 9):
         makers[f"polynomial-{n}"] = functools.partial(polynomial, n)
-    makers |= {name: functools.partial(Algorithm, name=name, **of) for name, of in _SCHEMES.items()}
     makers |= {
+        # From moments of the polynomial.
+        "magnus-6": functools.partial(scheme, "magnus-6", "magnus-6", 4, 6, "Blanes, Casas, Ros 2000"),
+        # From equation (17), with rates at 0, T/2, T.
+        "runge-kutta-4": functools.partial(scheme, "runge-kutta-4", "runge-kutta-4", 3, 4, "Kutta 1901"),
+        # q + ½ q ⊗ Δθ, normalised, as in many small projects.
+        "quaternion-euler": functools.partial(scheme, "quaternion-euler", "euler", 1, 2, "Euler 1768"),
         "one-sample-rate-2": functools.partial(compressed, 1, 0, 2),
         "two-sample-rate-2": functools.partial(compressed, 2, 0, 2),
         "four-sample-rate-2": functools.partial(compressed, 4, 0, 2),

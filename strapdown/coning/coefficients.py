@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+import operator
 from fractions import Fraction
 
 import numpy as np
@@ -64,32 +64,17 @@ def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(power * c for power, c in enumerate(angle) if power) for angle in summed)
 
 
-def _shifted(polynomial: Sequence[int], origin: int) -> list[int]:
-    """Return the coefficients in powers of (t − origin) of an integer polynomial in t."""
-    c = list(polynomial)
-    for low in range(len(c)):
-        for power in range(len(c) - 2, low - 1, -1):
-            c[power] += origin * c[power + 1]
-    return c
-
-
-def interval_rates(window: int, interval: int) -> Table:
-    """Return, per increment of the window, the rate polynomial in powers of s ∈ [−½, ½], the time from the interval's middle."""
+def rates_about(window: int, origin: Fraction) -> Table:
+    """Return, per increment of the window, the rate polynomial in powers of the time from an origin, a multiple of ½."""
     rows = []
     for basis in rate_basis(window):
-        doubled = [c * 2 ** (window - 1 - power) for power, c in enumerate(basis)]  # in x = 2t
-        centred = _shifted(doubled, 2 * interval + 1)
-        rows.append(
-            tuple(Fraction(c * 2**power, 2 ** (window - 1) * math.factorial(window)) for power, c in enumerate(centred))
-        )
+        c = [x * 2 ** (window - 1 - power) for power, x in enumerate(basis)]  # in 2t, so that all are integers
+        for low in range(window):
+            for power in range(window - 2, low - 1, -1):
+                c[power] += int(2 * origin) * c[power + 1]
+        scale = 2 ** (window - 1) * math.factorial(window)
+        rows.append(tuple(Fraction(x * 2**power, scale) for power, x in enumerate(c)))
     return tuple(rows)
-
-
-def _step_rates(samples: int, previous: int, following: int) -> Table:
-    """Return, for each increment of the window, the coefficients of the rate polynomial in powers of t − p."""
-    window = samples + previous + following
-    scale = math.factorial(window)
-    return tuple(tuple(Fraction(c, scale) for c in _shifted(basis, previous)) for basis in rate_basis(window))
 
 
 @functools.cache
@@ -98,8 +83,8 @@ def taylor_pairs(samples: int, previous: int = 0, following: int = 0) -> Table:
 
     It is exact, to second order in the rotation, if the body rate is a polynomial of degree M − 1.
     """
-    rates = _step_rates(samples, previous, following)
-    m = len(rates)
+    m = samples + previous + following
+    rates = rates_about(m, Fraction(previous))
     moment = [
         [Fraction(samples ** (a + b + 2), a + b + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / 2 for b in range(m)]
         for a in range(m)
@@ -170,52 +155,55 @@ def sum_of_tables(a: Table, b: Table) -> Table:
     return tuple(tuple(x + y for x, y in zip(r, s, strict=True)) for r, s in zip(a, b, strict=True))
 
 
-def step_moments(samples: int, count: int) -> Table:
-    """Return, for n = 0 … count − 1, the weights of the increments in ``B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt`` over the step of N samples, T = N."""
-    rows = []
-    for n in range(count):
-        row = []
-        for basis in _step_rates(samples, 0, 0):
-            total = Fraction(0)
-            for power, c in enumerate(basis):
-                for i in range(n + 1):  # (t − N/2)ⁿ by the binomial theorem
-                    factor = math.comb(n, i) * Fraction(-samples, 2) ** (n - i)
-                    total += c * factor * Fraction(samples ** (power + i + 1), power + i + 1)
-            row.append(total / samples**n)
-        rows.append(tuple(row))
-    return tuple(rows)
+@functools.cache
+def scheme_weights(solver: str, samples: int) -> Table:
+    """Return the weights of the increments in what a one-step scheme takes from the rate polynomial of a step, T = N intervals.
 
-
-def step_rates_at(samples: int, instants: Sequence[Fraction]) -> Table:
-    """Return the weights of the increments in T × (rate at each instant, 0 … N) of the polynomial through a step of N samples."""
-    basis = _step_rates(samples, 0, 0)
+    For ``"runge-kutta-4"`` T times the rates at 0, T/2 and T; for the others the moments ``B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt``, n = 0, 1, 2.
+    """
+    half = Fraction(samples, 2)
+    centred = rates_about(samples, half)
+    if solver == "runge-kutta-4":
+        return tuple(
+            tuple(samples * sum((c * t**power for power, c in enumerate(rate)), Fraction(0)) for rate in centred)
+            for t in (-half, Fraction(0), half)
+        )
+    moments = [[half ** (k + 1) * (1 - (-1) ** (k + 1)) / (k + 1) for k in range(n, n + samples)] for n in range(3)]
     return tuple(
-        tuple(samples * sum((c * t**power for power, c in enumerate(b)), Fraction(0)) for b in basis) for t in instants
+        tuple(sum(map(operator.mul, rate, moment), Fraction(0)) / samples**n for rate in centred)
+        for n, moment in enumerate(moments)
     )
+
+
+def scheme_products(solver: str, samples: int) -> Table:
+    """Return the pair table of a one-step scheme."""
+    weights = scheme_weights(solver, samples)
+    if solver == "euler":
+        return ((Fraction(0),) * samples,) * samples
+    if solver == "runge-kutta-4":
+        # Twice the vector part of the step quaternion has the products T²/12 (w₀ × w_½ + w_½ × w₁).
+        start, middle, end = weights
+        both = sum_of_tables(outer_pairs(start, middle), outer_pairs(middle, end))
+        return tuple(tuple(x / 12 for x in row) for row in both)
+    # magnus-6: α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
+    left = tuple((30 * x - 120 * z) / 240 for x, z in zip(weights[0], weights[2], strict=True))
+    return outer_pairs(left, tuple(12 * y for y in weights[1]))
 
 
 def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
     """Return the global order of convergence of a pair table for any smooth motion, without triple products.
 
-    For rates tᵃ and tᵇ along two axes the table must give ``½ ∫ (L_a L_b' − L_b L_a') dt``, L' the rates, L = 0 at the start of the step.
-    If the smallest a + b for which it does not is d, the error of a step is of order h^{d+2} and the global error of order h^{d+1}. The
-    products of three rates that such a table omits cause an error of order h⁵ per step, so the order is at most 4.
+    For the rates 1 and tᵇ along two axes the table must give ``½ ∫ (t tᵇ − tᵇ⁺¹/(b + 1)) dt`` over the step. If it does not, the error
+    of a step is of order h^{b+2} and the global error of order h^{b+1}. The products of three rates that such a table omits cause an error
+    of order h⁵ per step, so the order is at most 4.
     """
-    window, n = len(pairs), Fraction(samples)
-    edges = [Fraction(i - previous) for i in range(window + 1)]
-    for degree in range(1, 3):
-        for a in range((degree + 1) // 2):
-            b = degree - a
-            u, v = (
-                [(high ** (p + 1) - low ** (p + 1)) / (p + 1) for low, high in itertools.pairwise(edges)]
-                for p in (a, b)
-            )
-            # Since K is antisymmetric, Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j.
-            total = sum(
-                (k * x * y for row, x in zip(pairs, u, strict=True) for k, y in zip(row, v, strict=True)), Fraction(0)
-            )
-            if total != n ** (degree + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / (2 * (degree + 2)):
-                return degree + 1
+    edges = range(-previous, len(pairs) - previous + 1)
+    for b in (1, 2):
+        increments = [Fraction(high ** (b + 1) - low ** (b + 1), b + 1) for low, high in itertools.pairwise(edges)]
+        # Since K is antisymmetric, Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j, here with u_i = 1.
+        total = sum((k * x for row in pairs for k, x in zip(row, increments, strict=True)), Fraction(0))
+        if total != Fraction(samples ** (b + 2), 2 * (b + 2)) * (1 - Fraction(1, b + 1)):
+            return b + 1
     return 4
 
 

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from strapdown import checks
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import Algorithm, named
@@ -46,7 +48,9 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
     -5.02 °/h
     """
     table = named(algorithm)
-    beta, omega, lam = _motion(angle, frequency, sample_interval)
+    beta = checks.finite("angle", angle, unit="rad")
+    omega = 2.0 * math.pi * checks.positive("frequency", frequency, unit="Hz")
+    lam = omega * checks.positive("sample_interval", sample_interval, unit="s")
     if table.window == 1 and table.solver == "compressed" and not table.rate_points:
         return -0.5 * math.sin(beta) ** 2 * omega * (1.0 - math.sin(lam) / lam)
     return -float(table.drift_constant) * beta**2 * omega * lam**table.drift_order
@@ -58,16 +62,7 @@ def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> flo
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:
         raise InputError(f"frequency_ratio is {lam:g}; the series is valid up to 1 (6 samples a period): sample faster")
-    total = 0.0
-    for c in reversed(table.drift_series):
-        total = total * lam * lam + c
-    return total
-
-
-def _motion(angle: float, frequency: float, sample_interval: float) -> tuple[float, float, float]:
-    beta = checks.finite("angle", angle, unit="rad")
-    omega = 2.0 * math.pi * checks.positive("frequency", frequency, unit="Hz")
-    return beta, omega, omega * checks.positive("sample_interval", sample_interval, unit="s")
+    return float(np.polynomial.polynomial.polyval(lam * lam, table.drift_series))
 
 
 @dataclass(frozen=True, kw_only=True)

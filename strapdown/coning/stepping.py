@@ -27,8 +27,8 @@ from strapdown.kernels.integration import (
 from strapdown.kernels.machine import compiled
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-_UNTURNED = np.array(IDENTITY)
 _VECTOR_SOLVERS = ("compressed", "pairs")
+_SCHEMES = {"magnus-6": kernels.MAGNUS_6, "runge-kutta-4": kernels.RUNGE_KUTTA_4, "euler": kernels.EULER}
 
 EVEN = 1e-3
 """Maximum relative deviation of an interval from the mean of its window for which the intervals are treated as equal: the rounding of
@@ -69,9 +69,7 @@ def integrate(
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
-    initial = (
-        _UNTURNED if initial_attitude is IDENTITY else checks.unit_quaternions("initial_attitude", initial_attitude)
-    )
+    initial = checks.unit_quaternions("initial_attitude", initial_attitude)
     if initial.shape != (4,):
         raise InputError(f"initial_attitude has shape {initial.shape}, wanted (4,); pass one quaternion")
     late = table.window == 1 and _is_plain(increments)
@@ -255,8 +253,8 @@ def _steps(increments: Array, table: Algorithm) -> Array:
             increments, table.samples, previous, _fits(window), correction, rates, series, steps
         )
         return steps
-    weights, scheme = _scheme(table.solver, table.samples)
-    compiled(kernels.scheme_steps)(increments, weights, scheme, steps)
+    weights = exact.floats(exact.scheme_weights(table.solver, table.samples))
+    compiled(kernels.scheme_steps)(increments, weights, _SCHEMES[table.solver], steps)
     return steps
 
 
@@ -315,22 +313,8 @@ def _compressed_array(table: Algorithm, previous: int) -> Array:
 @functools.cache
 def _fits(window: int) -> Array:
     """Return (interval, increment, power): coefficients of the rate polynomial per increment, in time from the middle of the interval."""
-    tables = [exact.interval_rates(window, i) for i in range(window)]
+    tables = [exact.rates_about(window, Fraction(2 * i + 1, 2)) for i in range(window)]
     return np.array([exact.floats(table) for table in tables]).reshape(window, window, window)
-
-
-@functools.cache
-def _scheme(solver: str, samples: int) -> tuple[Array, int]:
-    numbers = {
-        "magnus-6": kernels.MAGNUS_6,
-        "runge-kutta-4": kernels.RUNGE_KUTTA_4,
-        "euler": kernels.EULER,
-    }
-    if solver == "runge-kutta-4":
-        table = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
-    else:
-        table = exact.step_moments(samples, 3)
-    return exact.floats(table), numbers[solver]
 
 
 @functools.cache
