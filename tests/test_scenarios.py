@@ -276,7 +276,7 @@ name = "tracker"
 sigma_across_arcsec = 5.0
 sigma_about_arcsec = 30.0
 rate_hz = 2.0
-boresight = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
+boresight = [1.2, 0.0, 1.6]
 """
     scenario = scenario_from_toml(text)
     np.testing.assert_allclose(scenario.gyro.scale_factor, [200e-6] * 3, rtol=1e-15)

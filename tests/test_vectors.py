@@ -454,16 +454,7 @@ def test_masked_measurements_are_missing_ones():
     np.testing.assert_allclose(series.sigma, 1e-3)
 
 
-@pytest.mark.parametrize(
-    "boresight",
-    [
-        (0.6, 0.0, 0.8),
-        (3.0, 0.0, 4.0),
-        tuple(np.roll(Rotation.from_euler("y", np.arctan2(0.6, 0.8)).as_quat(), 1)),
-        tuple(map(tuple, Rotation.from_euler("y", np.arctan2(0.6, 0.8)).as_matrix())),
-    ],
-    ids=["direction", "any length", "quaternion", "matrix"],
-)
+@pytest.mark.parametrize("boresight", [(0.6, 0.0, 0.8), (3.0, 0.0, 4.0)])
 def test_a_tracker_looks_where_it_is_mounted(boresight):
     """Its noise is that of a tracker along z, turned by the mounting: covariance by rotation matrices, and that of the samples."""
     tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=100.0, boresight=boresight)
@@ -483,16 +474,14 @@ def test_a_boresight_from_a_file_is_that_of_the_sensor_to_the_bit():
     assert dataclasses.replace(tracker).boresight == tracker.boresight
 
 
-@pytest.mark.parametrize(("boresight", "axis"), [("-x", "x"), ((0.0, -2.0, 0.0), "y"), ((1.0, 0.0, 0.0, 0.0), "z")])
+@pytest.mark.parametrize(("boresight", "axis"), [("-x", "x"), ((0.0, -2.0, 0.0), "y")])
 def test_a_boresight_along_a_body_axis_is_that_axis(boresight, axis):
     tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)
     assert tracker.boresight == axis
     assert tracker.covariance is None
 
 
-@pytest.mark.parametrize(
-    "boresight", ["w", (0.0, 0.0, 0.0), (1.0, 0.0), (2.0, 0.0, 0.0, 0.0), ((1.0, 0, 0), (0, 1, 0), (0, 0, -1))]
-)
+@pytest.mark.parametrize("boresight", ["w", (0.0, 0.0, 0.0), (1.0, 0.0), (2.0, 0.0, 0.0, 0.0)])
 def test_what_is_no_boresight_is_refused(boresight):
     with pytest.raises(InputError, match="boresight"):
         AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)

@@ -1,6 +1,5 @@
 """Attitude from vector observations: exact data, oracles at any weights, covariance by Monte Carlo, and what is refused."""
 
-import dataclasses
 import math
 
 import mpmath
@@ -11,8 +10,6 @@ from scipy.stats import chi2
 from strapdown import quaternion
 from strapdown.checks import InputError
 from strapdown.vectors import wahba
-
-BATCHES = [(), (1,), (5,), (2, 3)]
 
 
 def directions(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -75,10 +72,6 @@ def whiteness(error: np.ndarray, covariance: np.ndarray) -> None:
     assert low < np.mean(np.sum(white**2, axis=-1)) < high
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# The optimum
-
-
 def test_exact_data_give_the_exact_attitude() -> None:
     """With equal weights, and with weights over eight decades."""
     rng = np.random.default_rng(11)
@@ -139,34 +132,6 @@ def test_narrow_fields_of_view(angle: float) -> None:
         check_optimum(q, r, np.full(3, 1e-2 * angle), rng, 1e-14 + 4e-16 / angle)
 
 
-@pytest.mark.parametrize("shape", BATCHES)
-def test_batches_equal_single_sets(shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(17)
-    q = quaternion.normalize(rng.standard_normal((*shape, 4)))
-    r = geometry(rng, *shape, 4)
-    sigmas = 10.0 ** rng.uniform(-5, -2, (*shape, 4))
-    b = measured(q, r, sigmas, rng)
-    solution = wahba.solve(b, r, sigmas)
-    shapes = (solution.attitude.shape, solution.covariance.shape, solution.loss.shape)
-    assert shapes == ((*shape, 4), (*shape, 3, 3), shape)
-    for index in np.ndindex(shape):
-        single = wahba.solve(b[index], r[index], sigmas[index])
-        np.testing.assert_allclose(solution.attitude[index], single.attitude, atol=2e-15)
-        np.testing.assert_allclose(
-            solution.covariance[index], single.covariance, rtol=1e-9, atol=1e-9 * np.trace(single.covariance)
-        )
-        np.testing.assert_allclose(solution.chi_square[index], single.chi_square, rtol=1e-9)
-
-
-def test_one_catalogue_and_one_set_of_sigmas_serve_many_measurements() -> None:
-    rng = np.random.default_rng(19)
-    r, sigmas = geometry(rng, 3), np.array([1e-4, 1e-3, 1e-3])
-    b = measured(quaternion.normalize(rng.standard_normal((6, 4))), np.broadcast_to(r, (6, 3, 3)), sigmas, rng)
-    solution = wahba.solve(b, r, sigmas)
-    for k in range(6):
-        np.testing.assert_allclose(solution.attitude[k], wahba.solve(b[k], r, sigmas).attitude, atol=2e-15)
-
-
 def test_lengths_and_order_do_not_matter() -> None:
     rng = np.random.default_rng(18)
     r = geometry(rng, 5)
@@ -179,10 +144,6 @@ def test_lengths_and_order_do_not_matter() -> None:
     np.testing.assert_allclose(other.attitude, plain.attitude, atol=2e-15)
     np.testing.assert_allclose(other.loss, plain.loss, rtol=1e-10)
     np.testing.assert_allclose(other.covariance, plain.covariance, atol=1e-12 * np.trace(plain.covariance))
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Covariance and residual
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4])
@@ -207,20 +168,32 @@ def test_covariance_is_the_inverse_of_the_information(ratio: float) -> None:
         assert abs(least / theirs - 1.0) < 1e-14 * ratio**2
 
 
-@pytest.mark.parametrize("sigmas", [(1e-3, 1e-3), (1e-4, 3e-3, 1e-3), (1e-5, 1e-3, 1e-2, 3e-3, 1e-4, 1e-3)])
+@pytest.mark.parametrize(
+    "sigmas",
+    [
+        (1e-4, 3e-3, 1e-3),
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ((1e-3, 1e-3), (1e-5, 1e-3, 1e-2, 3e-3, 1e-4, 1e-3))),
+    ],
+)
 def test_covariance_and_residual_by_monte_carlo(sigmas: tuple[float, ...]) -> None:
+    """None of the draws is refused as inconsistent."""
     rng = np.random.default_rng(23)
     count, n = 5000, len(sigmas)
-    r = np.broadcast_to(geometry(rng, n), (count, n, 3))
+    r, dof = geometry(rng, n), 2 * n - 3
     q = quaternion.normalize(rng.standard_normal((count, 4)))
-    solution = wahba.solve(measured(q, r, np.array(sigmas), rng), r, sigmas)
-    whiteness(quaternion.log(quaternion.multiply(quaternion.conjugate(solution.attitude), q)), solution.covariance)
-    assert solution.dof == 2 * n - 3
-    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], solution.dof * count) / count
-    assert low < np.mean(solution.chi_square) < high
+    b = measured(q, np.broadcast_to(r, (count, n, 3)), np.array(sigmas), rng)
+    solutions = [wahba.solve(one, r, sigmas) for one in b]
+    attitude, covariance, loss, probability = (
+        np.array([getattr(solution, name) for solution in solutions])
+        for name in ("attitude", "covariance", "loss", "probability")
+    )
+    whiteness(quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), q)), covariance)
+    assert solutions[0].dof == dof
+    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], dof * count) / count
+    assert low < np.mean(2.0 * loss) < high
     # Its probability is uniform: mean ½ and variance 1/12.
-    assert abs(np.mean(solution.probability) - 0.5) < 4.5 / math.sqrt(12.0 * count)
-    np.testing.assert_allclose(solution.probability, chi2.sf(2.0 * solution.loss, solution.dof), rtol=1e-12)
+    assert abs(np.mean(probability) - 0.5) < 4.5 / math.sqrt(12.0 * count)
+    np.testing.assert_allclose(probability, chi2.sf(2.0 * loss, dof), rtol=1e-12)
 
 
 def test_the_residual_shows_a_sigma_too_small() -> None:
@@ -231,27 +204,13 @@ def test_the_residual_shows_a_sigma_too_small() -> None:
     assert wahba.solve(b, r, 1e-3).probability < 1e-4
 
 
-def test_results_are_frozen() -> None:
-    solution = wahba.solve(np.eye(3), np.eye(3), 1e-3)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        solution.loss = np.array(0.0)  # type: ignore[misc]
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The vertical and the heading
-
-
-@pytest.mark.parametrize("shape", BATCHES)
-def test_vertical_and_heading_for_any_attitude_and_dip(shape: tuple[int, ...]) -> None:
+def test_vertical_and_heading_for_any_attitude_and_dip() -> None:
     rng = np.random.default_rng(31)
     for q in attitudes(rng):
-        many = np.broadcast_to(q, (*shape, 4))
-        dip = rng.uniform(-1.4, 1.4, shape)
-        field_f = 48.0 * np.stack([np.zeros(shape), np.cos(dip), -np.sin(dip)], axis=-1)
-        up_b = quaternion.rotate(quaternion.conjugate(many), np.array([0.0, 0.0, 9.8]))
-        attitude = wahba.from_vertical_and_heading(up_b, quaternion.rotate(quaternion.conjugate(many), field_f))
-        assert attitude.shape == (*shape, 4)
-        assert np.max(quaternion.angle_between(attitude, many)) < 1e-14
+        for dip in rng.uniform(-1.4, 1.4, 8):
+            vectors_f = np.array([[0.0, 0.0, 9.8], [0.0, 48.0 * np.cos(dip), -48.0 * np.sin(dip)]])
+            attitude = wahba.from_vertical_and_heading(*quaternion.rotate(quaternion.conjugate(q), vectors_f))
+            assert quaternion.angle_between(attitude, q) < 1e-14
 
 
 def test_the_vertical_counts_most() -> None:
@@ -264,13 +223,10 @@ def test_the_vertical_counts_most() -> None:
     assert y > 0.0
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# What is refused
-
 EYE = np.eye(3)
 SKEWED = np.array([[1.3, 0.3, 0.3], [0.5, 1.5, 0.5], [0.1, 0.1, 1.1]])
 REFUSED = {
-    "one direction": ((EYE[:1], EYE[:1], 1e-3), "1 direction"),
+    "one direction": ((EYE[:1], EYE[:1], 1e-3), "1 directions and references_f 1"),
     "parallel": (([EYE[0], EYE[0]], [EYE[1], EYE[1]], 1e-3), "directions 0 and 1 .* 0° apart"),
     "opposite": (([EYE[0], -EYE[0]], [EYE[1], -EYE[1]], 1e-3), "directions 0 and 1 .* 180° apart"),
     "many on one line": (
@@ -306,9 +262,8 @@ REFUSED = {
     "NaN sigma": ((EYE[:2], EYE[:2], [1e-3, np.nan]), r"sigmas\[1\] is nan"),
     "zero sigma": ((EYE[:2], EYE[:2], [1e-3, 0.0]), r"sigmas\[1\] is 0 rad"),
     "number of sigmas": ((EYE[:2], EYE[:2], [1e-3] * 3), r"sigmas has shape \(3,\), wanted \(2,\)"),
-    "number of directions": ((EYE, EYE[:2], 1e-3), "3 directions but references_f has 2"),
-    "leading axes": ((np.stack([EYE] * 2), np.stack([EYE] * 3), 1e-3), "do not broadcast"),
-    "one vector": ((EYE[0], EYE[0], 1e-3), r"wanted \(\.\.\., n, 3\)"),
+    "number of directions": ((EYE, EYE[:2], 1e-3), "3 directions and references_f 2"),
+    "one vector": ((EYE[0], EYE[0], 1e-3), r"wanted \(n, 3\)"),
     "sigma of radians as weights": ((EYE[:2], EYE[:2], 100.0), "smaller sigmas"),
 }
 
@@ -318,24 +273,6 @@ def test_refused(case: str) -> None:
     arguments, message = REFUSED[case]
     with pytest.raises(InputError, match=message):
         wahba.solve(*arguments)
-
-
-def test_a_refusal_names_the_set_of_a_batch() -> None:
-    b = np.broadcast_to(EYE, (2, 3, 3, 3)).copy()
-    r = b.copy()
-    b[1, 2, 0] = [1.0, 0.2, 0.0]
-    with pytest.raises(InputError, match=r"directions 0 and 1 of set \[1, 2\]"):
-        wahba.solve(b, r, 1e-3)
-    b[1, 2] = r[1, 2] = EYE[:1]
-    with pytest.raises(InputError, match=r"references_f\[1, 2\]: the attitude is not determined"):
-        wahba.solve(b, r, 1e-3)
-
-
-def test_noise_as_given_is_not_refused() -> None:
-    rng = np.random.default_rng(41)
-    r = np.broadcast_to(geometry(rng, 4), (5000, 4, 3))
-    sigmas = np.array([1e-4, 1e-3, 3e-3, 1e-2])
-    wahba.solve(measured(quaternion.normalize(rng.standard_normal((5000, 4))), r, sigmas, rng), r, sigmas)
 
 
 def test_heading_refuses_a_vertical_field_and_free_fall() -> None:

@@ -8,32 +8,16 @@ from typing import Any
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, non_negative, numbers, one_of, unit_quaternions
+from strapdown.checks import Array, non_negative, one_of
 from strapdown.vectors.measurements import direction
 from strapdown.vectors.sensor import Sampled, attitude_of
-
-Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
 
 
 def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
     """Return a boresight as "x", "y" or "z" if it is along that axis, in either direction, otherwise as a unit vector."""
     if isinstance(value, str):
         return one_of(name, value.removeprefix("-"), ("x", "y", "z"))
-    components = np.asarray(numbers(name, value))
-    if components.shape == (4,):
-        (q,) = unit_quaternions(name, components[None])
-        b = quaternion.rotate(q, np.array([0.0, 0.0, 1.0]))
-    elif components.shape == (3, 3):
-        if not np.allclose(components @ components.T, np.eye(3), atol=1e-6) or np.linalg.det(components) < 0.0:
-            raise InputError(f"{name} is no rotation matrix: its rows must be orthogonal unit vectors, right-handed")
-        b = components[:, 2]
-    elif components.shape == (3,):
-        b = components
-    else:
-        raise InputError(
-            f"{name} has shape {components.shape}; give x, y or z, a direction (3,), or the mounting as a quaternion (4,) or matrix (3, 3)"
-        )
-    b = direction(name, b)
+    b = direction(name, value)
     k = int(np.argmax(np.abs(b)))
     return "xyz"[k] if abs(b[k]) > 1.0 - 1e-12 else tuple(b.tolist())
 
@@ -50,14 +34,13 @@ class AttitudeSensor(Sampled):
         Noise about the two axes across the boresight, rad.
     sigma_about : float
         Noise about the boresight, rad.
-    boresight : {"x", "y", "z"} or array_like (3,), (4,) or (3, 3), default "z"
-        Boresight: a body axis, a direction in body axes (3,), or the mounting, sensor to body, as a quaternion (4,), scalar first,
-        or a rotation matrix (3, 3), whose z axis is the boresight. Stored as an axis or a unit vector.
+    boresight : {"x", "y", "z"} or array_like (3,), default "z"
+        Boresight: a body axis, or a direction in body axes. Stored as an axis or a unit vector.
     """
 
     sigma_across: float
     sigma_about: float
-    boresight: Boresight = "z"
+    boresight: str | tuple[float, ...] = "z"
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -71,28 +54,26 @@ class AttitudeSensor(Sampled):
         if isinstance(self.boresight, str):
             return None
         b = np.asarray(self.boresight)
-        return np.asarray(
-            self.sigma_across**2 * (np.eye(3) - np.outer(b, b)) + self.sigma_about**2 * np.outer(b, b), np.float64
-        )
+        along = np.outer(b, b)
+        return np.asarray(self.sigma_across**2 * (np.eye(3) - along) + self.sigma_about**2 * along)
 
     @property
     def sigma_axes(self) -> Array:
         """Noise about each body axis (3,), rad."""
         if isinstance(self.boresight, str):
             return np.where(np.arange(3) == "xyz".index(self.boresight), self.sigma_about, self.sigma_across)
-        assert self.covariance is not None
-        return np.sqrt(np.diag(self.covariance))
+        return np.sqrt(np.diagonal(self.covariance))  # type: ignore[arg-type]
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
-        noise = self.sigma_axes * white
-        if not isinstance(self.boresight, str):
+        covariance, noise = self.covariance, self.sigma_axes * white
+        if covariance is not None:
             b = np.asarray(self.boresight)
             noise = self.sigma_across * white + (self.sigma_about - self.sigma_across) * (white @ b)[:, None] * b
-        error = quaternion.exp(noise + correlated)
-        whole = self.covariance
         return {
             "kind": "attitude",
-            "attitude": quaternion.multiply(attitude_of(motion, time), error).reshape(-1, 4),
-            "sigma_axes": self.sigma_axes if whole is None else None,
-            "covariance": whole,
+            "attitude": quaternion.multiply(attitude_of(motion, time), quaternion.exp(noise + correlated)).reshape(
+                -1, 4
+            ),
+            "sigma_axes": self.sigma_axes if covariance is None else None,
+            "covariance": covariance,
         }

@@ -43,33 +43,25 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
 
     Parameters
     ----------
-    up_b : array_like (..., 3)
+    up_b : array_like (3,)
         Specific force of a body at rest (an accelerometer then measures *up*), any unit, body axes.
-    magnetic_b : array_like (..., 3)
+    magnetic_b : array_like (3,)
         Magnetic field without hard and soft iron, any unit, body axes.
 
     Returns
     -------
-    ndarray (..., 4)
-        Unit quaternions q_fb (TRIAD; Black 1964). The vertical is matched exactly; only the horizontal part of the field is used, which
+    ndarray (4,)
+        Unit quaternion q_fb (TRIAD; Black 1964). The vertical is matched exactly; only the horizontal part of the field is used, which
         points North whatever the dip.
     """
-    up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
-    angle = np.asarray(_angle(up, field))
-    bad = np.minimum(angle, np.pi - angle) < MIN_HORIZONTAL_ANGLE
-    if np.any(bad):
-        index = np.argwhere(bad)[0]
+    up, field = _directions("up_b", up_b, (3,)), _directions("magnetic_b", magnetic_b, (3,))
+    angle = float(_angle(up, field))
+    if min(angle, np.pi - angle) < MIN_HORIZONTAL_ANGLE:
         raise InputError(
-            f"{place('up_b', index)} and {place('magnetic_b', index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
-            f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
+            f"up_b and magnetic_b are {angle / DEGREE:.6g}° apart, less than {MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a "
+            "field gives no heading; check both"
         )
-    up, field = np.broadcast_arrays(up, field)
-    pairs = zip(up.reshape(-1, 3).tolist(), field.reshape(-1, 3).tolist(), strict=True)
-    return np.array([first_attitude(*pair) for pair in pairs]).reshape(*up.shape[:-1], 4)
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Any number of directions
+    return np.array(first_attitude(up.tolist(), field.tolist()))
 
 
 class InconsistentError(InputError):
@@ -82,11 +74,11 @@ class Solution:
 
     Parameters
     ----------
-    attitude : ndarray (..., 4)
-        Unit quaternions q_fb, w ≥ 0.
-    covariance : ndarray (..., 3, 3)
+    attitude : ndarray (4,)
+        Unit quaternion q_fb, w ≥ 0.
+    covariance : ndarray (3, 3)
         Covariance of the body-side error δθ, q_true = q ⊗ exp(δθ), rad²: ``[Σ (I − b bᵀ)/σ²]⁻¹``.
-    loss : ndarray (...,)
+    loss : float
         Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum.
     dof : int
         Degrees of freedom of the residual: two per direction, less three.
@@ -94,20 +86,20 @@ class Solution:
 
     attitude: Array
     covariance: Array
-    loss: Array
+    loss: float
     dof: int
 
     @property
-    def chi_square(self) -> Array:
+    def chi_square(self) -> float:
         """Twice the loss: χ² with ``dof`` degrees of freedom if directions and σ are correct."""
-        return np.asarray(2.0 * self.loss)
+        return 2.0 * self.loss
 
     @property
-    def probability(self) -> Array:
-        """Probability of a residual at least as large with correct data (...,). Near 0: outlier, wrong reference or σ too small."""
+    def probability(self) -> float:
+        """Probability of a residual at least as large with correct data. Near 0: outlier, wrong reference or σ too small."""
         from scipy.special import chdtrc
 
-        return np.asarray(chdtrc(self.dof, self.chi_square))
+        return float(chdtrc(self.dof, self.chi_square))
 
 
 def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> Solution:
@@ -119,11 +111,11 @@ def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> S
 
     Parameters
     ----------
-    vectors_b : array_like (..., n, 3)
+    vectors_b : array_like (n, 3)
         Directions measured in the body frame.
-    references_f : array_like (..., n, 3)
+    references_f : array_like (n, 3)
         The same directions in the fixed frame, in the same order.
-    sigmas : array_like (..., n) or float
+    sigmas : array_like (n,) or float
         Noise of each component across each direction, rad.
 
     Returns
@@ -139,57 +131,50 @@ def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> S
 
     Examples
     --------
-    >>> found = solve([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 1e-3)
-    >>> found.attitude.tolist(), found.dof
+    >>> solution = solve([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 1e-3)
+    >>> solution.attitude.tolist(), solution.dof
     ([1.0, 0.0, 0.0, 0.0], 1)
     """
-    b, r = _directions("vectors_b", vectors_b), _directions("references_f", references_f)
-    for name, value in (("vectors_b", b), ("references_f", r)):
-        if value.ndim < 2:
-            raise InputError(f"{name} has shape {value.shape}, wanted (..., n, 3); pass one row a direction")
-    if b.shape[-2] != r.shape[-2]:
+    b, r = _directions("vectors_b", vectors_b, ("n", 3)), _directions("references_f", references_f, ("n", 3))
+    if len(b) != len(r) or len(b) < 2:
         raise InputError(
-            f"vectors_b has {b.shape[-2]} directions but references_f has {r.shape[-2]}; pass them in pairs"
+            f"vectors_b has {len(b)} directions and references_f {len(r)}; give two or more, in pairs, that are not on one line"
         )
-    if b.shape[-2] < 2:
+    sigma = array("sigmas", sigmas, (...,))
+    if sigma.shape not in ((), (len(b),)):
         raise InputError(
-            f"vectors_b has {b.shape[-2]} direction(s), which leaves the rotation about it undetermined; give two or more, not on one line"
+            f"sigmas has shape {sigma.shape}, wanted ({len(b)},); give one number a direction, or one for all"
         )
-    try:
-        b, r = (np.asarray(value) for value in np.broadcast_arrays(b, r))
-    except ValueError:
-        raise InputError(
-            f"vectors_b has shape {b.shape} and references_f {r.shape}, which do not broadcast; give both the same leading axes"
-        ) from None
-    sigma = _sigmas(sigmas, b.shape[:-1])
+    sigma = np.broadcast_to(sigma, len(b))
+    if np.any(sigma <= 0.0):
+        k = int(np.argmax(sigma <= 0.0))
+        raise InputError(f"sigmas[{k}] is {sigma[k]:g} rad; every direction needs a σ greater than zero")
     _refuse_inconsistent(b, r, sigma)
     _refuse_undetermined("references_f", r, sigma)
     _refuse_undetermined("vectors_b", b, sigma)
 
-    # Only ratios of weights matter: the most precise direction has weight 1. The Gauss–Newton steps correct the effect of the minimum.
-    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
-    attitude = _refined(_svd(b, r, weight), b, r, sigma)
-    attitude = np.where(attitude[..., :1] < 0.0, -attitude, attitude)
+    attitude = _refined(_svd(b, r, sigma), b, r, sigma)
+    attitude = -attitude if attitude[0] < 0.0 else attitude
     predicted = _to_body(attitude, r)
     root = np.linalg.inv(_factorised(predicted, b - predicted, sigma)[0])
     return Solution(
         attitude=attitude,
-        covariance=np.asarray(root @ np.swapaxes(root, -1, -2)),
-        loss=0.5 * np.sum(np.square((b - predicted) / sigma[..., None]), axis=(-2, -1)),
-        dof=2 * b.shape[-2] - 3,
+        covariance=np.asarray(root @ root.T),
+        loss=float(0.5 * np.sum(np.square((b - predicted) / sigma[:, None]))),
+        dof=2 * len(b) - 3,
     )
 
 
 def _to_body(attitude: Array, vectors_f: Array) -> Array:
-    return quaternion.rotate(quaternion.conjugate(attitude)[..., None, :], vectors_f)
+    return quaternion.rotate(quaternion.conjugate(attitude), vectors_f)
 
 
-def _svd(b: Array, r: Array, weight: Array) -> Array:
+def _svd(b: Array, r: Array, sigma: Array) -> Array:
     """Return the R of largest tr(R Bᵀ), B = Σ a r bᵀ = U S Vᵀ: U diag(1, 1, det U det V) Vᵀ (Markley 1988, J. Astronaut. Sci. 36)."""
-    U, _, Vt = np.linalg.svd(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
-    handed = np.linalg.det(U) * np.linalg.det(Vt)
-    U = U * np.stack([np.ones_like(handed), np.ones_like(handed), np.sign(handed)], axis=-1)[..., None, :]
-    return quaternion.from_matrix(U @ Vt)
+    # Only ratios of weights matter: the most precise direction has weight 1. The Gauss–Newton steps correct the effect of the minimum.
+    weight = np.maximum(np.square(np.min(sigma) / sigma), MIN_WEIGHT)
+    U, _, Vt = np.linalg.svd((weight[:, None] * r).T @ b)
+    return quaternion.from_matrix(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt)
 
 
 def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array, Array]:
@@ -197,21 +182,18 @@ def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array,
 
     By orthogonal factorisation: the normal equations would lose the digits of the smallest weights.
     """
-    scale = sigma[..., None, None]
-    rows = (skew(predicted) / scale).reshape(*predicted.shape[:-2], -1, 3)
-    right = (residual[..., None] / scale).reshape(*rows.shape[:-1], 1)
+    rows = (skew(predicted) / sigma[:, None, None]).reshape(-1, 3)
     Q, triangle = np.linalg.qr(rows)
-    return triangle, np.swapaxes(Q, -1, -2) @ right
+    return triangle, Q.T @ (residual / sigma[:, None]).ravel()
 
 
 def _refined(attitude: Array, b: Array, r: Array, sigma: Array) -> Array:
     """Return the attitude after Gauss–Newton steps on Wahba's loss, down to the size of rounding errors."""
     for _ in range(_GAUSS_NEWTON_STEPS):
         predicted = _to_body(attitude, r)
-        triangle, right = _factorised(predicted, b - predicted, sigma)
-        step = np.linalg.solve(triangle, right)[..., 0]
+        step = np.linalg.solve(*_factorised(predicted, b - predicted, sigma))
         attitude = quaternion.normalize(quaternion.multiply(attitude, quaternion.exp(step)))
-        if np.max(np.abs(step), initial=0.0) < ROUNDING:
+        if np.max(np.abs(step)) < ROUNDING:
             break
     return attitude
 
@@ -219,14 +201,10 @@ def _refined(attitude: Array, b: Array, r: Array, sigma: Array) -> Array:
 _GAUSS_NEWTON_STEPS = 10
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# Checks of the input
-
-
-def _directions(name: str, value: ArrayLike) -> Array:
-    """Return vectors (..., 3) divided by their lengths."""
-    vector = array(name, value, (..., 3))
-    largest = np.max(np.abs(vector), axis=-1, keepdims=True, initial=0.0)
+def _directions(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
+    """Return vectors divided by their lengths."""
+    vector = array(name, value, shape)
+    largest = np.max(np.abs(vector), axis=-1, keepdims=True)
     if np.any(largest == 0.0):
         index = np.argwhere(largest[..., 0] == 0.0)[0]
         raise InputError(f"{place(name, index)} is the zero vector, which has no direction; leave it out")
@@ -235,60 +213,36 @@ def _directions(name: str, value: ArrayLike) -> Array:
     return np.asarray(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
 
 
-def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    sigma = array("sigmas", value, (...,))
-    try:
-        sigma = np.broadcast_to(sigma, shape)
-    except ValueError:
-        raise InputError(
-            f"sigmas has shape {sigma.shape}, wanted {shape}; give one number a direction, or one for all"
-        ) from None
-    if np.any(sigma <= 0.0):
-        index = np.argwhere(sigma <= 0.0)[0]
-        raise InputError(
-            f"{place('sigmas', index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
-        )
-    return sigma
-
-
 def _angle(u: Array, v: Array) -> Array:
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.sum(u * v, axis=-1)))
 
 
 def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
     """Reject pairs whose angle differs between the frames by more than the noise allows."""
-    i, j = np.triu_indices(b.shape[-2], 1)
-    angle_b, angle_f = _angle(b[..., i, :], b[..., j, :]), _angle(r[..., i, :], r[..., j, :])
-    allowed = INCONSISTENT * np.hypot(sigma[..., i], sigma[..., j]) + 4.0 * ROUNDING
+    i, j = np.triu_indices(len(b), 1)
+    angle_b, angle_f = _angle(b[i], b[j]), _angle(r[i], r[j])
+    allowed = INCONSISTENT * np.hypot(sigma[i], sigma[j]) + 4.0 * ROUNDING
     excess = np.abs(angle_b - angle_f) / allowed
-    if np.any(excess > 1.0):
-        *index, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        here = (*index, k)
-        allowed_here = float(np.broadcast_to(allowed, excess.shape)[here])
+    k = int(np.argmax(excess))
+    if excess[k] > 1.0:
         raise InconsistentError(
-            f"directions {i[k]} and {j[k]}{' of set ' + str([int(n) for n in index]) if index else ''} are "
-            f"{np.broadcast_to(angle_b, excess.shape)[here] / DEGREE:.6g}° apart in the body frame but "
-            f"{np.broadcast_to(angle_f, excess.shape)[here] / DEGREE:.6g}° in the fixed frame, where the noise allows a difference of "
-            f"{allowed_here / DEGREE:.3g}° ({INCONSISTENT:g} σ); check for a mixed-up pair, a reference in another frame, an outlier "
-            "or a σ too small"
+            f"directions {i[k]} and {j[k]} are {angle_b[k] / DEGREE:.6g}° apart in the body frame but {angle_f[k] / DEGREE:.6g}° in the "
+            f"fixed frame, where the noise allows a difference of {allowed[k] / DEGREE:.3g}° ({INCONSISTENT:g} σ); check for a mixed-up "
+            "pair, a reference in another frame, an outlier or a σ too small"
         )
 
 
 def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
-    """Reject sets of directions that lie on one line within the noise, so that a rotation is undetermined."""
-    rows = skew(vectors) / np.maximum(sigma, ROUNDING)[..., None, None]
-    least = np.linalg.svd(rows.reshape(*rows.shape[:-3], -1, 3), compute_uv=False)[..., -1]
-    bad = least < 1.0 / LARGEST_UNCERTAINTY
-    if np.any(bad):
-        index = tuple(np.argwhere(bad)[0]) if np.ndim(bad) else ()
-        directions = vectors[index]
-        i, j = np.triu_indices(directions.shape[-2], 1)
-        angle = _angle(directions[i], directions[j])
-        widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
-        uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
+    """Reject directions that lie on one line within the noise, so that a rotation is undetermined."""
+    rows = skew(vectors) / np.maximum(sigma, ROUNDING)[:, None, None]
+    least = float(np.linalg.svd(rows.reshape(-1, 3), compute_uv=False)[-1])
+    if least < 1.0 / LARGEST_UNCERTAINTY:
+        i, j = np.triu_indices(len(vectors), 1)
+        angle = _angle(vectors[i], vectors[j])
+        k = int(np.argmax(np.minimum(angle, np.pi - angle)))
+        uncertainty = "without bound" if least == 0.0 else f"{1.0 / least:.3g} rad"
         raise InputError(
-            f"{place(name, index)}: the attitude is not determined, the 1σ of its least determined rotation is "
-            f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
-            f"{angle[widest] / DEGREE:.6g}° "
-            "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"
+            f"{name}: the attitude is not determined, the 1σ of its least determined rotation is {uncertainty}; of all pairs, directions "
+            f"{i[k]} and {j[k]} are furthest from one line, {angle[k] / DEGREE:.6g}° apart; add a direction away from that line, or give "
+            "smaller sigmas (rad) if the noise is smaller"
         )
