@@ -82,11 +82,8 @@ class VectorMeasurements(ByValue):
             name = f"{self.sensor}: attitude"
             quaternions = array(name, self.attitude, (m, 4), allow_nan=True)
             missing = _missing(quaternions)
-            if missing.any():
-                whole = unit_quaternions(name, np.where(missing[:, None], quaternion.IDENTITY, quaternions))
-                store["attitude"] = np.where(missing[:, None], quaternions, whole)
-            else:
-                store["attitude"] = unit_quaternions(name, quaternions)
+            whole = unit_quaternions(name, np.where(missing[:, None], quaternion.IDENTITY, quaternions))
+            store["attitude"] = np.where(missing[:, None], quaternions, whole)
             store["vector_b"] = np.full((m, 3), np.nan)
         else:
             if self.attitude is not None:
@@ -147,47 +144,42 @@ class VectorMeasurements(ByValue):
 
     def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
         """Return sigma (m,), and sigma_axes (m, 3) and covariance (m, 3, 3) if they are given."""
+        name, attitude = self.sensor, self.kind == "attitude"
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
-            raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
-        known: Any = ~missing if missing.any() else slice(None)
-        columns, axes = self._noise_of_axes(m, missing, known)
+            raise InputError(f"{name}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
         sigma = self._sigma(m, missing)
         has_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
-        if axes is None and self.kind == "attitude":
-            if not has_sigma:
-                raise InputError(
-                    f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
-                )
-            columns["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
-        if axes is not None:
-            mean = np.sqrt(np.mean(axes**2, axis=1))
-            same = np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0)
-            if self.kind != "attitude" and has_sigma and not same:
-                raise InputError(
-                    f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
-                )
-            sigma = mean
-        return columns | {"sigma": sigma}
-
-    def _noise_of_axes(self, m: int, missing: np.ndarray, known: Any) -> tuple[dict[str, Array], Array | None]:
-        """Return sigma_axes (m, 3) and covariance (m, 3, 3) if they are given, and σ of the axes (m, 3) from either."""
         columns: dict[str, Array] = {}
         axes: Array | None = None
+
+        def agrees(value: Array, other: Array) -> bool:
+            return np.allclose(value[~missing], other[~missing], rtol=1e-12, atol=0.0)
+
         if self.sigma_axes is not None:
             own = self._repeated("sigma_axes", (m, 3), "one number per body axis (3,), or (m, 3)")
-            axes = _of_known(f"{self.sensor}: sigma_axes", own, missing, _root_mean_square)
+            columns["sigma_axes"] = axes = _of_known(f"{name}: sigma_axes", own, missing, _root_mean_square)
             if np.any(axes < 0.0):
-                raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
-            columns["sigma_axes"] = axes
+                raise InputError(f"{name}: sigma_axes has a negative entry; give standard deviations")
         if self.covariance is not None:
-            columns["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m, missing)
+            columns["covariance"] = whole = _covariances(f"{name}: covariance", self.covariance, m, missing)
             diagonal = np.sqrt(np.einsum("kii->ki", whole))
-            if axes is not None and not np.allclose(axes[known], diagonal[known], rtol=1e-12, atol=0.0):
-                raise InputError(f"{self.sensor}: sigma_axes and covariance contradict each other; give one of them")
+            if axes is not None and not agrees(axes, diagonal):
+                raise InputError(f"{name}: sigma_axes and covariance contradict each other; give one of them")
             axes = diagonal
-            if self.kind == "attitude":
+            if attitude:
                 columns["sigma_axes"] = axes
-        return columns, axes
+        if axes is not None:
+            mean = np.sqrt(np.mean(axes**2, axis=1))
+            if not attitude and has_sigma and not agrees(sigma, mean):
+                raise InputError(
+                    f"{name}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
+                )
+            return columns | {"sigma": mean}
+        if attitude and not has_sigma:
+            raise InputError(
+                f"{name}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
+            )
+        return {"sigma": sigma} | ({"sigma_axes": np.repeat(sigma[:, None], 3, axis=1)} if attitude else {})
 
     def _sigma(self, m: int, missing: np.ndarray) -> Array:
         """Return sigma (m,), checked."""
