@@ -95,41 +95,6 @@ def test_series_and_closed_form_meet_without_a_step():
         assert np.abs(kinematics.right_jacobian(angle * direction) - wanted).max() <= 4 * EPS * np.abs(wanted).max()
 
 
-@pytest.mark.parametrize("angle", [1e-9, 1e-3, 0.5, 2.0, 3.0, 5.0])
-def test_definition_exp_of_a_sum(angle):
-    """exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ): the derivative of Log(exp(−φ) ⊗ exp(φ + δ)) at δ = 0, by 60-digit differences."""
-    phi = angle * np.array([0.36, -0.48, 0.8])
-
-    def exp(v):
-        theta = mp.sqrt(sum(c * c for c in v))
-        s = mp.sin(theta / 2) / theta
-        return [mp.cos(theta / 2), *(s * c for c in v)]
-
-    def times(p, q):
-        a, b, c, d = p
-        w, x, y, z = q
-        return [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-
-    J = np.empty((3, 3))
-    with mp.workdps(60):
-        exact = [mp.mpf(float(c)) for c in phi]
-        back = exp([-c for c in exact])
-        h = mp.mpf(10) ** -25
-        for k in range(3):
-            columns = []
-            for sign in (1, -1):
-                moved = [c + (sign * h if i == k else 0) for i, c in enumerate(exact)]
-                difference = times(back, exp(moved))
-                columns.append([2 * c / difference[0] for c in difference[1:]])  # the log, to third order in h
-            J[:, k] = [float((a - b) / (2 * h)) for a, b in zip(*columns, strict=True)]
-    np.testing.assert_allclose(kinematics.right_jacobian(phi), J, rtol=0.0, atol=4 * EPS)
-
-
 def test_body_rate_is_the_jacobian_times_the_derivative_of_the_rotation_vector(rotation_vectors):
     """w_b = J_r(φ) φ̇ against equation (17) with q̇ from central differences of exp."""
     phi, speed = rotation_vectors(40, 0.01, 3.0), random((40,), 3, 9)
@@ -138,14 +103,6 @@ def test_body_rate_is_the_jacobian_times_the_derivative_of_the_rotation_vector(r
     q_dot = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
     w_b = kinematics.body_rate(quaternion.exp(phi), q_dot)
     np.testing.assert_allclose((kinematics.right_jacobian(phi) @ speed[..., None])[..., 0], w_b, atol=1e-9)
-
-
-def test_transpose_is_the_left_jacobian(rotation_vectors):
-    """J_l(φ) = J_r(−φ) = J_r(φ)ᵀ = R(φ) J_r(φ)."""
-    phi = rotation_vectors(60)
-    J = kinematics.right_jacobian(phi)
-    np.testing.assert_allclose(kinematics.right_jacobian(-phi), np.swapaxes(J, -1, -2), atol=2 * EPS)
-    np.testing.assert_allclose(quaternion.to_matrix(quaternion.exp(phi)) @ J, np.swapaxes(J, -1, -2), atol=8 * EPS)
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, (0,)])

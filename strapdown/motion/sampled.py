@@ -23,8 +23,8 @@ _WIDEST_DEGREES = 170.0
 class SampledAttitude(ByValue):
     """Smooth motion through given attitudes: a spline of the quaternions in four dimensions, scaled to the unit sphere.
 
-    ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs
-    no iteration and no small-angle approximation, and the motion does not depend on the choice of body and fixed axes. The rate
+    ``q = s/|s|`` with s a spline of degree 5, four times continuously differentiable. Unlike a spline of rotation vectors it needs no
+    iteration and no small-angle approximation, and the motion does not depend on the choice of body and fixed axes. The rate
     ``w_b = 2 vec(s* ⊗ ṡ)/|s|²`` is exact for this motion; increments are its integrals, converged to rounding.
 
     Parameters
@@ -33,23 +33,17 @@ class SampledAttitude(ByValue):
         Times, s, increasing; the motion is defined between the first and the last.
     attitudes : array_like (n, 4)
         Unit quaternions q_fb, of either sign, consecutive ones less than 170° apart.
-    degree : {5, 3}, default 5
-        Degree of the spline.
     ends : {"free", "rest"}, default "free"
-        Condition at the ends: none, or zero rate (for degree 5 also zero angular acceleration).
+        Condition at the ends: none, or zero rate and angular acceleration.
     """
 
     time: Array
     attitudes: Array
-    degree: int = 5
     ends: str = "free"
 
     def __post_init__(self) -> None:
-        if self.degree not in (3, 5):
-            raise checks.InputError(f"degree is {self.degree!r}; it must be 3 or 5")
         checks.one_of("ends", self.ends, ("free", "rest"))
-        least = self.degree + 1 if self.ends == "free" else 2
-        time = checks.increasing("time", self.time, minimum=least).copy()
+        time = checks.increasing("time", self.time, minimum=6 if self.ends == "free" else 2).copy()
         samples = checks.unit_quaternions("attitudes", checks.array("attitudes", self.attitudes, ("n", 4)))
         if len(samples) != len(time):
             raise checks.InputError(f"attitudes has {len(samples)} rows for {len(time)} stamps; give one per stamp")
@@ -65,7 +59,6 @@ class SampledAttitude(ByValue):
         time.flags.writeable = samples.flags.writeable = False
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "attitudes", samples)
-        object.__setattr__(self, "degree", int(self.degree))
 
     @property
     def breaks(self) -> Array:
@@ -76,9 +69,9 @@ class SampledAttitude(ByValue):
     def _splines(self) -> tuple[Any, Any, Any]:
         from scipy.interpolate import make_interp_spline
 
-        still = [(order, np.zeros(4)) for order in range(1, (self.degree + 1) // 2)]
+        still = [(order, np.zeros(4)) for order in (1, 2)]
         ends = (still, still) if self.ends == "rest" else None
-        spline = make_interp_spline(self.time, self.attitudes, k=self.degree, bc_type=ends)
+        spline = make_interp_spline(self.time, self.attitudes, k=5, bc_type=ends)
         return spline, spline.derivative(), spline.derivative(2)
 
     def _inside(self, time: Array) -> Array:
@@ -119,7 +112,7 @@ class SampledAttitude(ByValue):
         return interval_integrals(self.body_rate, stamps, self.time)
 
 
-def waypoints(time: ArrayLike, attitudes: ArrayLike, *, degree: int = 5) -> SampledAttitude:
+def waypoints(time: ArrayLike, attitudes: ArrayLike) -> SampledAttitude:
     """Return the smooth motion from rest through the given attitudes to rest.
 
     Parameters
@@ -128,12 +121,10 @@ def waypoints(time: ArrayLike, attitudes: ArrayLike, *, degree: int = 5) -> Samp
         Times, s, increasing; n ≥ 2.
     attitudes : array_like (n, 4)
         Unit quaternions q_fb, consecutive ones less than 170° apart.
-    degree : {5, 3}, default 5
-        Degree of the spline.
 
     Returns
     -------
     SampledAttitude
         The motion, with ``ends="rest"``.
     """
-    return SampledAttitude(time=np.asarray(time), attitudes=np.asarray(attitudes), degree=degree, ends="rest")
+    return SampledAttitude(time=np.asarray(time), attitudes=np.asarray(attitudes), ends="rest")
