@@ -188,20 +188,13 @@ class Function:
             empty: Any = ({}, {}, {})
             array.known, array.changed, array.loaded = state if left or array.name is None else empty
 
-    def branch(self, condition: Any, then: Callable[[], None], otherwise: Callable[[], None] | None = None) -> None:
-        """Execute one of two bodies."""
-        if not isinstance(condition, Symbol):
-            body = then if condition else otherwise
-            if body is not None:
-                body()
-            return
+    def branch(self, condition: Symbol, then: Callable[[], None], otherwise: Callable[[], None] | None = None) -> None:
+        """Execute one of two bodies, according to a condition that is known only on the target."""
         self.flush()
-        blocks = [Block(self.block)]
-        if otherwise is not None:
-            blocks.append(Block(self.block))
+        bodies = [then] if otherwise is None else [then, otherwise]
+        blocks = [Block(self.block) for _ in bodies]
         self.add(Statement("if", values=(condition,), blocks=blocks))
-        for block, body in zip(blocks, (then, otherwise), strict=False):
-            assert body is not None
+        for block, body in zip(blocks, bodies, strict=True):
             self.inside(block, body)
 
     def leave_loop(self) -> None:

@@ -12,7 +12,7 @@ import inspect
 import math
 import operator
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import FunctionType, MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -36,9 +36,6 @@ class Range:
 
     start: Any
     stop: Any
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(range(self.start, self.stop))
 
 
 class Bind(NamedTuple):
@@ -362,9 +359,7 @@ class Interpreter:
             values = [end[name] for end in ends if name in end]
             env.pop(name, None)
             if len(values) == 2:
-                if same(*values):
-                    env[name] = values[0]
-                elif pure:
+                if pure:
                     env[name] = self._selected(condition, *values)
                 else:
                     env[name] = self._merged(name, values, parent, place, blocks)
@@ -471,12 +466,3 @@ class Interpreter:
 def is_number(value: Any) -> bool:
     """Return whether a value is a number of the target or of Python."""
     return isinstance(value, Symbol | int | float)
-
-
-def same(a: Any, b: Any) -> bool:
-    """Return whether two values are the same symbols or equal numbers."""
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    if isinstance(a, Symbol) or isinstance(b, Symbol) or not (is_number(a) and is_number(b)):
-        return a is b
-    return a == b and type(a) is type(b)

@@ -12,7 +12,19 @@ from typing import Any
 
 PINNED = ("load", "at", "result", "parameter")
 """Kinds of symbols that stay in the block in which they were made."""
+INTEGER = ("+", "-", "*", "neg", "//", "%", "|", "select")
+"""Operations whose result is an integer, if the operands are."""
 CONDITIONS = ("<", ">", "<=", ">=", "==", "&&", "||", "not")
+
+
+def binary(kind: str) -> Callable[[Symbol, Any], Any]:
+    """Return the method of an operator with the symbol on its left."""
+    return lambda self, other: self.trace.symbol(kind, self, other)
+
+
+def reflected(kind: str) -> Callable[[Symbol, Any], Any]:
+    """Return the method of an operator with the symbol on its right."""
+    return lambda self, other: self.trace.symbol(kind, other, self)
 
 
 class Symbol:
@@ -39,9 +51,6 @@ class Symbol:
     def __sub__(self, other: Any) -> Any:
         return self if other == 0 and not isinstance(other, Symbol) else self.trace.symbol("-", self, other)
 
-    def __rsub__(self, other: Any) -> Any:
-        return self.trace.symbol("-", other, self)
-
     def __mul__(self, other: Any) -> Any:
         return NotImplemented if isinstance(other, list) else self.trace.product(self, other)
 
@@ -51,45 +60,19 @@ class Symbol:
     def __pow__(self, other: int) -> Any:
         return self * self if other == 2 else NotImplemented
 
-    def __truediv__(self, other: Any) -> Any:
-        return self.trace.symbol("/", self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self.trace.symbol("/", other, self)
-
     def __neg__(self) -> Any:
         return self.trace.symbol("neg", self)
 
     def __abs__(self) -> Any:
         return self.trace.symbol("fabs", self)
 
-    def __floordiv__(self, other: Any) -> Any:
-        return self.trace.symbol("//", self, other)
-
-    def __mod__(self, other: Any) -> Any:
-        return self.trace.symbol("%", self, other)
-
-    def __lt__(self, other: Any) -> Any:
-        return self.trace.symbol("<", self, other)
-
-    def __gt__(self, other: Any) -> Any:
-        return self.trace.symbol(">", self, other)
-
-    def __le__(self, other: Any) -> Any:
-        return self.trace.symbol("<=", self, other)
-
-    def __ge__(self, other: Any) -> Any:
-        return self.trace.symbol(">=", self, other)
-
-    def __and__(self, other: Any) -> Any:
-        return self.trace.condition("&&", self, other)
-
-    __rand__ = __and__
-
     def __or__(self, other: Any) -> Any:
         return self.trace.condition("||", self, other)
 
     __ror__ = __or__
+    __rsub__, __truediv__, __rtruediv__ = reflected("-"), binary("/"), reflected("/")
+    __floordiv__, __mod__ = binary("//"), binary("%")
+    __lt__, __gt__, __le__, __ge__ = binary("<"), binary(">"), binary("<="), binary(">=")
 
 
 def type_of(kind: str, operands: tuple[Any, ...]) -> str:
@@ -105,10 +88,6 @@ def type_of(kind: str, operands: tuple[Any, ...]) -> str:
     if kind == "select":
         del types[0]
     return "int" if kind in INTEGER and "" not in types else ""
-
-
-INTEGER = ("+", "-", "*", "neg", "//", "%", "|", "select")
-"""Operations whose result is an integer, if the operands are."""
 
 
 class Trace:
