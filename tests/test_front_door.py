@@ -154,16 +154,6 @@ def test_one_state_by_name_is_that_of_the_command(succeeds, tmp_path):
     assert call.error_states["gyro scale"].values.shape[1] == 1
 
 
-def test_estimate_of_a_recording_is_that_of_the_command(succeeds, tmp_path):
-    path = phone_recording(tmp_path)
-    units = ("--gyro-unit", "deg/s", "--accelerometer-unit", "g", "--time-unit", "s")
-    succeeds("estimate", path, *units, "--out", tmp_path / "o")
-    command = sd.read(tmp_path / "o" / "estimate.h5")
-    call = sd.estimate(sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g"}))
-    np.testing.assert_array_equal(call.attitude, command.attitude)
-    np.testing.assert_array_equal(call.variance, command.variance)
-
-
 def test_without_a_seed_a_campaign_has_that_of_the_scenario(tmp_path):
     sd.write(scenario(10.0), tmp_path / "small.toml")
     call = sd.monte_carlo(tmp_path / "small.toml", runs=10, threads=1)
