@@ -12,10 +12,14 @@ from strapdown.codegen.symbols import Symbol, Trace, Values
 
 @dataclass(eq=False)
 class Block:
-    """Statements that are executed together."""
+    """Statements that are executed together, or an arm of a selection, which has none."""
 
     parent: Block | None = None
     statements: list[Statement] = field(default_factory=list)
+    depth: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.depth = 0 if self.parent is None else self.parent.depth + 1
 
 
 @dataclass(eq=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strapdown.codegen.functions import Block, Function, Statement
-from strapdown.codegen.regions import Group, Placement, Slot, values_in
+from strapdown.codegen.regions import Group, Placement, values_in
 from strapdown.codegen.symbols import PINNED, Symbol
 
 PRECEDENCE = {"||": 1, "&&": 2, "|": 2.5, "<": 3, ">": 3, "<=": 3, ">=": 3, "==": 3, "+": 4, "-": 4}
@@ -72,19 +72,18 @@ class Writer:
     # ------------------------------------------------------------------------------------------------------------------------ statements
 
     def _block(self, block: Block) -> None:
-        slot = self.placement.blocks[block]
         for statement in block.statements:
             if statement.kind not in ("comment", "array", "variable"):
-                self._symbols(self._loads_before(statement, slot), slot)
-                self._symbols(self.placement.needed(values_in(statement), slot, self.written), slot)
+                self._symbols(self._loads_before(statement, block), block)
+                self._symbols(self.placement.needed(values_in(statement), block, self.written), block)
             getattr(self, f"_{statement.kind}")(statement)
 
-    def _loads_before(self, statement: Statement, slot: Slot) -> list[Symbol]:
+    def _loads_before(self, statement: Statement, block: Block) -> list[Symbol]:
         """Return the loads that a statement with an effect must not overtake."""
         alive, places = self.placement.alive, self.placement.places
         kinds = ("load", "at")
-        loads = [x for x in alive if x.kind in kinds and x.number < statement.number and places[x] is slot]
-        return self.placement.needed(loads, slot, self.written)
+        loads = [x for x in alive if x.kind in kinds and x.number < statement.number and places[x] is block]
+        return self.placement.needed(loads, block, self.written)
 
     def _comment(self, statement: Statement) -> None:
         self.line(f"/* {statement.text} */")
@@ -168,13 +167,13 @@ class Writer:
 
     # --------------------------------------------------------------------------------------------------------------------------- symbols
 
-    def _symbols(self, symbols: list[Symbol], slot: Slot) -> None:
+    def _symbols(self, symbols: list[Symbol], block: Block) -> None:
         for symbol in symbols:
             if symbol in self.written:
                 continue
             group = self.placement.groups.get(symbol)
             if group is not None:
-                self._group(group, slot)
+                self._group(group, block)
             elif not self._inlined(symbol):
                 self._declare(symbol)
 
@@ -199,16 +198,15 @@ class Writer:
         """Return whether a place is a parameter or a local array that nothing changes while its elements are used."""
         return not place.startswith("f->") and place.partition("[")[0] not in self.function.changing
 
-    def _group(self, group: Group, slot: Slot) -> None:
+    def _group(self, group: Group, block: Block) -> None:
         """Write selections with the same condition as one branch."""
         members = group.members
-        self._symbols(self.placement.needed((x for m in members for x in m.operands), slot, self.written), slot)
+        self._symbols(self.placement.needed((x for m in members for x in m.operands), block, self.written), block)
         names = [self._new("m") for _ in members]
         for kind in dict.fromkeys(member.type for member in members):
             own = [name for name, member in zip(names, members, strict=True) if member.type == kind]
             self.line(f"{self.language.variable[kind]} {', '.join(own)};")
         self.line(f"if ({self.text(members[0].operands[0])}) {{")
-        assert group.arms is not None
         for i, arm in enumerate(group.arms, 1):
             if i == 2:
                 self.line("} else {")
@@ -232,16 +230,15 @@ class Writer:
 
     @functools.cached_property
     def user_here(self) -> set[Symbol]:
-        """Operations whose users, statements ``if`` among them, are in the same slot, outside the arms of a selection."""
+        """Operations whose users, statements ``if`` among them, are in the same block, outside the arms of a selection."""
         places, groups, here = self.placement.places, self.placement.groups, set(self.placement.conditions)
         for user in self.placement.alive:
             group = groups.get(user)
             if group is not None:
-                assert group.arms is not None
                 pairs = list(zip(user.operands[1:], group.arms, strict=True))
             else:
                 pairs = [] if user.kind in PINNED else [(x, places[user]) for x in user.operands]
-            here |= {x for x, slot in pairs if isinstance(x, Symbol) and places[x] is slot}
+            here |= {x for x, block in pairs if isinstance(x, Symbol) and places[x] is block}
         return here
 
     def _new(self, stem: str) -> str:
