@@ -32,7 +32,7 @@ DIGITS = 50
 SMALL = {"quick": True}
 """Arguments of a quick test run."""
 OWN = ("matched-2-8", "matched-4-11", "matched-1-4-4", "matched-1-8-8")
-PUBLISHED = tuple(name for name in ALGORITHMS if name not in OWN and "-rate-" not in name)
+PUBLISHED = tuple(name for name in ALGORITHMS if name not in OWN)
 ROUNDING = 2.0**-52
 """Errors per step below this are rounding and not due to the algorithm, rad."""
 
@@ -214,22 +214,6 @@ def coning_increments(angle: Any, ratio: Any, first: int, last: int) -> list[Vec
     return [tuple(b - a for a, b in zip(u, v, strict=True)) for u, v in itertools.pairwise(edges)]
 
 
-def rate_increments(angle: Any, ratio: Any, first: int, last: int, points: int) -> list[Vector]:
-    """Return the increments by ``points``-point quadrature from samples of the coning rate."""
-
-    def rate(k: Any) -> Vector:
-        return (
-            -ratio * mp.sin(angle) * mp.sin(ratio * k),
-            ratio * mp.sin(angle) * mp.cos(ratio * k),
-            ratio * (mp.cos(angle) - 1),
-        )
-
-    nodes = [mp.mpf(j) - (points // 2 - 1) for j in range(points)]
-    right = mp.matrix([mp.mpf(1) / (m + 1) for m in range(points)])
-    weights = list(mp.lu_solve(mp.matrix([[x**m for x in nodes] for m in range(points)]), right))
-    return [combination(weights, [rate(k + x) for x in nodes]) for k in range(first, last)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class ConingError:
     """Errors of an algorithm under continuous coning."""
@@ -246,10 +230,7 @@ def exact_error(algorithm: str | Algorithm, angle: float, ratio: float, digits: 
     with mp.workdps(digits + 10):
         beta, lam = mp.mpf(angle), mp.mpf(ratio)
         first, last = -table.previous, table.samples + table.following
-        if table.rate_points:
-            window = rate_increments(beta, lam, first, last, table.rate_points)
-        else:
-            window = coning_increments(beta, lam, first, last)
+        window = coning_increments(beta, lam, first, last)
         turn = table.samples * lam
         about_z = (mp.cos(turn / 2), mp.mpf(0), mp.mpf(0), mp.sin(turn / 2))
         start = (mp.cos(beta / 2), mp.sin(beta / 2), mp.mpf(0), mp.mpf(0))
@@ -356,7 +337,6 @@ CURVES = (
     "magnus-6",
     "polynomial-4",
     "polynomial-8",
-    "four-sample-rate-2",
     "matched-4-11",
     "matched-1-8-8",
 )
@@ -606,9 +586,7 @@ def main(*, out: str | Path | None = None, quick: bool = False, seed: int = 1) -
             20.0 * DEGREE,
             0.2,
         ),
-        costs=tuple(
-            cost(name, 5.0 * DEGREE, 0.3, 840 if quick else 20160) for name in ALGORITHMS if "-rate-" not in name
-        ),
+        costs=tuple(cost(name, 5.0 * DEGREE, 0.3, 840 if quick else 20160) for name in ALGORITHMS),
         manoeuvres=manoeuvres(3 if quick else 60, seed),
     )
     if out is not None:

@@ -6,7 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from sims.coning_algorithms import OWN, PUBLISHED, coning_increments, exact_error, rate_increments
+from sims.coning_algorithms import OWN, PUBLISHED, coning_increments, exact_error
 from strapdown import coning, quaternion
 from strapdown.checks import InputError
 from strapdown.coning import ALGORITHMS, VibrationLine, vibration_drift
@@ -23,11 +23,7 @@ def double_precision_drift(name, angle, ratio):
     first, last = -before, n + table.previous + table.following + 2
     with mp.workdps(40):
         beta, lam = mp.mpf(angle), mp.mpf(ratio)
-        exact = (
-            rate_increments(beta, lam, first, last, table.rate_points)
-            if table.rate_points
-            else coning_increments(beta, lam, first, last)
-        )
+        exact = coning_increments(beta, lam, first, last)
     attitude = coning.integrate(np.array(exact, dtype=float), table)
     step = quaternion.multiply(quaternion.conjugate(attitude[before // n]), attitude[before // n + 1])
     turn = 0.5 * n * ratio

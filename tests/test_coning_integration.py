@@ -29,16 +29,10 @@ MOTIONS = {
 SECONDS = 12.0
 
 
-def integrated_rates(rates, interval, algorithm, first=quaternion.IDENTITY):
-    """Attitude from rate samples, by the quadrature that the algorithm is made for; eight points for one made for increments."""
-    points = coning.named(algorithm).rate_points or 8
-    return coning.integrate(coning.increments_from_rates(rates, interval, points), algorithm, first)
-
-
 @functools.cache
 def truth(name, n):
     edges = np.linspace(0.0, SECONDS, n + 1)
-    return MOTIONS[name].attitude(edges), MOTIONS[name].increments(edges), MOTIONS[name].body_rate(edges)
+    return MOTIONS[name].attitude(edges), MOTIONS[name].increments(edges)
 
 
 def angle_errors(estimate, true):
@@ -47,12 +41,8 @@ def angle_errors(estimate, true):
 
 
 def greatest_error(algorithm, name, n):
-    true, increments, rates = truth(name, n)
-    if algorithm.rate_points:
-        estimate = integrated_rates(rates, SECONDS / n, algorithm, true[0])
-    else:
-        estimate = coning.integrate(increments, algorithm, true[0])
-    return angle_errors(estimate, true[:: algorithm.samples]).max()
+    true, increments = truth(name, n)
+    return angle_errors(coning.integrate(increments, algorithm, true[0]), true[:: algorithm.samples]).max()
 
 
 def measured_order(algorithm, name):
@@ -88,11 +78,9 @@ def test_constant_rate_is_exact():
     for name, algorithm in ALGORITHMS.items():
         if algorithm.solver in ("euler", "runge-kutta-4"):
             continue  # approximates even a constant rate
-        if algorithm.rate_points:
-            attitude = integrated_rates(spin.body_rate(t), 0.1, algorithm)
-        else:
-            attitude = coning.integrate(spin.increments(t), algorithm)
-        error = angle_errors(attitude, spin.attitude(t)[:: algorithm.samples]).max()
+        error = angle_errors(
+            coning.integrate(spin.increments(t), algorithm), spin.attitude(t)[:: algorithm.samples]
+        ).max()
         assert error < (2e-13 if name == "matched-4-11" else 5e-14), name
 
 
@@ -344,10 +332,7 @@ def test_short_records_and_rests(extra):
     for name, algorithm in ALGORITHMS.items():
         n = algorithm.samples + extra
         t = np.arange(n + 1) * 0.1
-        if algorithm.rate_points:
-            attitude = integrated_rates(cone.body_rate(t), 0.1, algorithm, cone.attitude(0.0))
-        else:
-            attitude = coning.integrate(cone.increments(t), algorithm, cone.attitude(0.0))
+        attitude = coning.integrate(cone.increments(t), algorithm, cone.attitude(0.0))
         assert len(attitude) == n // algorithm.samples + 1, name
         assert angle_errors(attitude, cone.attitude(t)[:: algorithm.samples][: len(attitude)]).max() < 2e-5, name
 
@@ -389,7 +374,7 @@ def test_increments_from_few_rates():
 
 
 def test_rate_samples_cost_what_the_docstring_says():
-    # The trapezoid under an increment correction drifts like no correction at all; made for rates, the table drifts at λ⁴.
+    # Increments by the trapezoid drift like no correction at all; by eight points, as the algorithm does with true increments.
     cone = motion.Coning(angle=0.01, frequency=1.0)
     h = 0.02
     t = np.arange(4001) * h
@@ -401,10 +386,12 @@ def test_rate_samples_cost_what_the_docstring_says():
         last = quaternion.multiply(attitude[-1], quaternion.conjugate(true[-1]))
         return 2 * (last[3] - error[3]) / (t[-1] - t[200]) / (cone.angle**2 * 2 * math.pi)
 
-    naive = coning.integrate(coning.increments_from_rates(cone.body_rate(t), h, 2), "two-sample", true[0])
-    for_rates = integrated_rates(cone.body_rate(t), h, "two-sample-rate-2", true[0])
+    naive, eight = (
+        coning.integrate(coning.increments_from_rates(cone.body_rate(t), h, points), "two-sample", true[0])
+        for points in (2, 8)
+    )
     assert drift(naive) == pytest.approx(-(lam**2) / 12, rel=0.05)
-    assert drift(for_rates) == pytest.approx(-float(ALGORITHMS["two-sample-rate-2"].drift_constant) * lam**4, rel=0.05)
+    assert drift(eight) == pytest.approx(-float(ALGORITHMS["two-sample"].drift_constant) * lam**4, rel=0.05)
 
 
 @pytest.mark.parametrize(

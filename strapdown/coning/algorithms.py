@@ -60,8 +60,6 @@ class Algorithm:
         p, number of increments used before the step.
     following : int, default 0
         f, number of increments used after the step: the delay in samples.
-    rate_points : int, default 0
-        Number of rate samples in the quadrature of one increment; 0 if the algorithm uses true increments.
     order : int
         Global order of convergence for any smooth motion and exact increments.
     products : tuple of tuples of Fraction
@@ -77,7 +75,6 @@ class Algorithm:
     samples: int
     previous: int = 0
     following: int = 0
-    rate_points: int = 0
     order: int
     products: Table = field(repr=False)
     source: str = ""
@@ -85,10 +82,8 @@ class Algorithm:
     def __post_init__(self) -> None:
         """Check sizes, solver and products."""
         checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
-        for what, minimum in (("samples", 1), ("order", 1), ("previous", 0), ("following", 0), ("rate_points", 0)):
+        for what, minimum in (("samples", 1), ("order", 1), ("previous", 0), ("following", 0)):
             checks.count(f"{self.name}: {what}", getattr(self, what), minimum=minimum)
-        if self.rate_points % 2:
-            raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
         m, table = self.window, self.products
         if len(table) != m or any(len(row) != m for row in table):
             raise InputError(f"{self.name}: products is not {m} by {m}, one row for each increment of the window")
@@ -270,7 +265,7 @@ class Algorithm:
         """
         table: dict[str, Any] = {"name": self.name, "samples": self.samples}
         table |= {name: getattr(self, name) for name in ("previous", "following", "source") if getattr(self, name)}
-        if self.solver == "compressed" and not self.rate_points:
+        if self.solver == "compressed":
             table["coefficients"] = [str(k) for k in reversed(self.coefficients)]
         elif self.solver == "pairs":
             rows = enumerate(self.products, start=1)
@@ -283,13 +278,6 @@ class Algorithm:
     def window(self) -> int:
         """M = N + p + f, number of increments used for one step."""
         return self.samples + self.previous + self.following
-
-    @property
-    def needs(self) -> str:
-        """Description of the input: increments or rates, and the delay."""
-        if self.rate_points:
-            return f"rates ({self.rate_points}-point quadrature)"
-        return "increments" + (f", {self.following} samples late" if self.following else "")
 
     @property
     def coefficients(self) -> Rationals:
@@ -342,7 +330,7 @@ class Algorithm:
 
     def _drift_series(self, terms: int) -> Rationals:
         """Return the coefficients of λ⁰, λ², λ⁴, … of the drift divided by β²ω."""
-        return tuple(c / self.samples for c in exact.residuals(self.lags, self.samples, self.rate_points, terms))
+        return tuple(c / self.samples for c in exact.residuals(self.lags, self.samples, terms))
 
     @functools.cached_property
     def drift_series(self) -> tuple[float, ...]:
@@ -404,26 +392,19 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
 # ------------------------------------------------------------------------------------------------------------------- makers
 
 
-def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorithm:
+def compressed(samples: int, previous: int = 0) -> Algorithm:
     """Return the coning-optimal compressed algorithm with N samples and p samples of the previous step."""
-    name = f"{_NUMBERS[samples - 1]}-sample" + (f"-previous-{previous}" if previous else "")
     m = samples + previous
-    if rate_points:
-        name += f"-rate-{rate_points}"
-        table = exact.rate_compressed_coefficients(samples, previous, rate_points)
-    else:
-        table = exact.compressed_coefficients(samples, previous)
     return Algorithm(
-        name=name,
+        name=f"{_NUMBERS[samples - 1]}-sample" + (f"-previous-{previous}" if previous else ""),
         solver="compressed",
         samples=samples,
         previous=previous,
-        rate_points=rate_points,
         # One lag-symmetric cross product is optimal for coning. For general motion it is exact for linear rates only; two samples gain an
         # order by symmetry.
-        order=2 if m == 1 or rate_points == 2 else 4 if (samples, previous) == (2, 0) else 3,
-        products=_with_last(tuple(reversed(table))),
-        source="this package, from rate samples" if rate_points else "Miller 1983; Ignagni 1996; Savage 2010",
+        order=2 if m == 1 else 4 if (samples, previous) == (2, 0) else 3,
+        products=_with_last(tuple(reversed(exact.compressed_coefficients(samples, previous)))),
+        source="Miller 1983; Ignagni 1996; Savage 2010",
     )
 
 
@@ -524,12 +505,6 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
         "runge-kutta-4": functools.partial(scheme, "runge-kutta-4", "runge-kutta-4", 3, 4, "Kutta 1901"),
         # q + ½ q ⊗ Δθ, normalised, as in many small projects.
         "quaternion-euler": functools.partial(scheme, "quaternion-euler", "euler", 1, 2, "Euler 1768"),
-        "one-sample-rate-2": functools.partial(compressed, 1, 0, 2),
-        "two-sample-rate-2": functools.partial(compressed, 2, 0, 2),
-        "four-sample-rate-2": functools.partial(compressed, 4, 0, 2),
-        "four-sample-rate-4": functools.partial(compressed, 4, 0, 4),
-        "four-sample-rate-8": functools.partial(compressed, 4, 0, 8),
-        "one-sample-previous-3-rate-2": functools.partial(compressed, 1, 3, 2),
         "matched-2-8": functools.partial(matched, 2, 8),
         "matched-4-11": functools.partial(matched, 4, 11),
         "matched-1-4-4": functools.partial(matched, 1, 4, 4),
@@ -559,10 +534,9 @@ def algorithm_table(seconds: Mapping[str, float] | None = None) -> results.Table
     column = results.Column
     columns = [
         column("name", "name"),
-        column("needs", "needs"),
         column("N", "samples"),
         column(None, "previous"),
-        column(None, "following"),
+        column("later", "following"),
         column("order", "order"),
         column("n", "drift_order"),
         column("C", "drift_constant", 3),
@@ -573,12 +547,11 @@ def algorithm_table(seconds: Mapping[str, float] | None = None) -> results.Table
     for a in ALGORITHMS.values():
         times = [] if seconds is None else [1e9 * seconds[a.name]]
         orders = (a.samples, a.previous, a.following, a.order, a.drift_order, float(a.drift_constant))
-        rows.append((a.name, a.needs, *orders, *times, a.source))
+        rows.append((a.name, *orders, *times, a.source))
     notes = (
-        "Use increments if the gyro provides them. From rate samples (…-rate-K: K samples form one increment) an oscillation "
-        "appears too small by a fraction of order (ωh)^K, which lowers the drift order. matched-… were derived for this package.",
+        "From rate samples, form increments of eight points (increments_from_rates). matched-… were derived for this package: "
         "matched-1-8-8 is the most accurate and needs 8 later samples; matched-4-11 runs in real time; four-sample is enough in most "
         "cases.",
     )
     title = "Integration algorithms: drift under small coning is −C β² ω (ωh)^n"
-    return results.Table(title, columns, rows, notes, left=2, name="algorithms")
+    return results.Table(title, columns, rows, notes, name="algorithms")

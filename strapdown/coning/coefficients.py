@@ -230,69 +230,26 @@ def outer_pairs(a: Rationals, b: Rationals) -> Table:
     return tuple(tuple(x * v - u * y for u, v in zip(a, b, strict=True)) for x, y in zip(a, b, strict=True))
 
 
-def rate_weights(points: int, interval: int | None = None) -> Rationals:
-    """Return the weights that integrate the polynomial through ``points`` rate samples over one interval (the middle one by default).
+def rate_weights(points: int, interval: int) -> Rationals:
+    """Return the weights that integrate the polynomial through ``points`` rate samples over one of the intervals between them.
 
-    Two points: the trapezoidal rule, ½ and ½. Four: −1/24, 13/24, 13/24, −1/24.
+    Two points: the trapezoidal rule, ½ and ½. Four, the middle one: −1/24, 13/24, 13/24, −1/24.
     """
-    start = Fraction(points // 2 - 1 if interval is None else interval)
+    start = Fraction(interval)
     powers = range(points)  # that the weights integrate exactly
     integrals = [((start + 1) ** (k + 1) - start ** (k + 1)) / (k + 1) for k in powers]
     return solve([[Fraction(node) ** k for node in range(points)] for k in powers], integrals)
 
 
-def squared_gain(points: int, terms: int) -> Rationals:
-    """Return the coefficients of λ⁰, λ², λ⁴, … of g², g the gain for an oscillation of increments formed from rate samples.
-
-    ``g = Σ_j b_j cos((j − ½)λ) (λ/2)/sin(λ/2)``, b the two-sided weights; 1 − λ²/6 + … for the trapezoidal rule. ``points`` = 0: true
-    increments, g = 1.
-    """
-    if points == 0:
-        return (Fraction(1), *(Fraction(0),) * (terms - 1))
-    weights = rate_weights(points)
-    middle = Fraction(points - 1, 2)
-    cosine = [
-        sum((w * (j - middle) ** (2 * n) for j, w in enumerate(weights)), Fraction(0))
-        * Fraction((-1) ** n, math.factorial(2 * n))
-        for n in range(terms)
-    ]
-    sine = [Fraction((-1) ** n, 4**n * math.factorial(2 * n + 1)) for n in range(terms)]
-    gain: list[Fraction] = []
-    for n in range(terms):
-        gain.append(cosine[n] - sum((gain[k] * sine[n - k] for k in range(n)), Fraction(0)))
-    return tuple(sum((gain[k] * gain[n - k] for k in range(n + 1)), Fraction(0)) for n in range(terms))
-
-
-def residuals(lags: Rationals, samples: int, points: int, terms: int) -> Rationals:
-    """Return the coefficients of λ, λ³, λ⁵, … of the drift of a step over β²: ``g² Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − g² sin Nλ)``."""
-    sines = []
+def residuals(lags: Rationals, samples: int, terms: int) -> Rationals:
+    """Return the coefficients of λ, λ³, λ⁵, … of the drift of a step over β²: ``Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)``."""
+    total = []
     for n in range(terms):
         q = 2 * n + 1
         moment = sum((k * ((j + 1) ** q + (j - 1) ** q - 2 * j**q) for j, k in enumerate(lags, start=1)), Fraction(0))
-        sines.append((Fraction(samples**q, 2) - moment) * Fraction((-1) ** n, math.factorial(q)))
-    gain = squared_gain(points, terms)
-    total = [sum((sines[k] * gain[n - k] for k in range(n + 1)), Fraction(0)) for n in range(terms)]
+        total.append((Fraction(samples**q, 2) - moment) * Fraction((-1) ** n, math.factorial(q)))
     total[0] -= Fraction(samples, 2)
     return tuple(total)
-
-
-def rate_compressed_coefficients(samples: int, previous: int, points: int) -> Rationals:
-    """Return the compressed coefficients for increments formed from rate samples; they compensate the drift due to the quadrature.
-
-    A quadrature over ``points`` rate samples scales an oscillation by g ≠ 1, which with coefficients for true increments causes a drift of
-    order λ^points. The coefficients here solve ``g² Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − g² sin Nλ)`` instead, up to λ^{2M−1}, so that the
-    drift is of order λ^{2M} again; the periodic error of the quadrature remains.
-    """
-    m = samples + previous
-    if m == 1:
-        return ()
-    base = residuals((Fraction(0),) * (m - 1), samples, points, m)[1:]
-    rows = []
-    for lag in range(1, m):
-        unit = tuple(Fraction(int(j == lag)) for j in range(1, m))
-        with_lag = residuals(unit, samples, points, m)[1:]
-        rows.append([a - b for a, b in zip(with_lag, base, strict=True)])
-    return solve([[row[q] for row in rows] for q in range(m - 1)], [-b for b in base])
 
 
 def solve(matrix: list[list[Fraction]], right: list[Fraction]) -> Rationals:

@@ -51,7 +51,7 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
     beta = checks.finite("angle", angle, unit="rad")
     omega = 2.0 * math.pi * checks.positive("frequency", frequency, unit="Hz")
     lam = omega * checks.positive("sample_interval", sample_interval, unit="s")
-    if table.window == 1 and table.solver == "compressed" and not table.rate_points:
+    if table.window == 1 and table.solver == "compressed":
         return -0.5 * math.sin(beta) ** 2 * omega * (1.0 - math.sin(lam) / lam)
     return -float(table.drift_constant) * beta**2 * omega * lam**table.drift_order
 

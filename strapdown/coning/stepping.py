@@ -108,9 +108,8 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     sample_interval : float
         Interval between samples, s.
     points : int, default 2
-        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoidal rule. Use ``rate_points`` of an
-        algorithm for rates; for others use 8, because the trapezoidal rule with a correction for increments drifts as much as no
-        correction.
+        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoidal rule, which drifts under coning
+        as much as no correction does. Use 8 for the algorithms of the catalogue.
 
     Returns
     -------
@@ -303,11 +302,7 @@ def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tup
 def _compressed_array(table: Algorithm, previous: int) -> Array:
     if previous == table.previous:
         return table.coefficient_array
-    if table.rate_points:
-        row = exact.rate_compressed_coefficients(table.samples, previous, table.rate_points)
-    else:
-        row = exact.compressed_coefficients(table.samples, previous)
-    return np.array([float(k) for k in row])
+    return np.array([float(k) for k in exact.compressed_coefficients(table.samples, previous)])
 
 
 @functools.cache
