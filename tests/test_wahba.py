@@ -182,7 +182,7 @@ def test_covariance_and_residual_by_monte_carlo(sigmas: tuple[float, ...]) -> No
     r, dof = geometry(rng, n), 2 * n - 3
     q = quaternion.normalize(rng.standard_normal((count, 4)))
     b = measured(q, np.broadcast_to(r, (count, n, 3)), np.array(sigmas), rng)
-    solutions = [wahba.solve(one, r, sigmas) for one in b]
+    solutions = [wahba.solve(vectors_b, r, sigmas) for vectors_b in b]
     attitude, covariance, loss, probability = (
         np.array([getattr(solution, name) for solution in solutions])
         for name in ("attitude", "covariance", "loss", "probability")

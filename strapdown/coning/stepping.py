@@ -78,7 +78,7 @@ def integrate(
         # The conjugate of equation (3) is equation (17) for q* and −w.
         samples = -samples
         initial = quaternion.conjugate(initial)
-    attitude = _empty_rows(len(samples) // table.samples + 1)
+    attitude = np.empty((len(samples) // table.samples + 1, 4))
     work = np.empty(WORK)
     uneven, corrected = _uneven(samples, edges, table)
     if table.solver in _VECTOR_SOLVERS:
@@ -204,14 +204,6 @@ def _is_plain(increments: ArrayLike) -> bool:
         and increments.shape[1] == 3
         and increments.flags.c_contiguous
     )
-
-
-def _empty_rows(count: int) -> Array:
-    """Return an empty array (count, 4) aligned to cache lines, so that no row crosses one."""
-    line = 8
-    array = np.empty(4 * count + line)
-    first = -(array.__array_interface__["data"][0] // array.itemsize) % line
-    return array[first : first + 4 * count].reshape(count, 4)
 
 
 def _increments(increments: ArrayLike) -> Array:
