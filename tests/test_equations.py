@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_continuous_are
 
-from strapdown import allan, coning, gyro, kinematics, motion, quaternion
+from strapdown import allan, coning, gyro, kinematics
 from strapdown.motion import orbit
 from strapdown.vectors import wahba
 
@@ -26,16 +26,6 @@ def test_the_bortz_equation_as_bortz_wrote_it(angle, axis):
         factor = float((1 - size * mp.sin(size) / (2 * (1 - mp.cos(size)))) / size**2)
     expected = w + 0.5 * np.cross(phi, w) + factor * np.cross(phi, np.cross(phi, w))
     assert_allclose(np.linalg.inv(kinematics.right_jacobian(phi)) @ w, expected, rtol=1e-14)
-
-
-def test_a_slew_is_its_polynomial_and_its_largest_rate_35_sixteenths():
-    slew = motion.Slew(rotation_vector=(0.0, 0.0, 2.0), duration=8.0, start=1.0)
-    s = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
-    x = np.linspace(0.0, 1.0, 33)
-    assert_allclose(quaternion.log(slew.attitude(1.0 + 8.0 * x))[:, 2], 2.0 * s(x), atol=1e-15)
-    assert [float(s.deriv(k)(end)) for k in (1, 2, 3) for end in (0, 1)] == [0.0] * 6
-    rates = slew.body_rate(1.0 + 8.0 * np.linspace(0.0, 1.0, 10_001))[:, 2]
-    assert rates.max() == slew.body_rate(5.0)[2] == pytest.approx(35.0 / 16.0 * 2.0 / 8.0, rel=1e-15)
 
 
 @pytest.mark.parametrize(("white", "walk", "density"), [(0.1, 0.2, 1.0), (1e-3, 0.5, 1e-2), (2.0, 1e-3, 7.0)])

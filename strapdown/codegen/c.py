@@ -257,7 +257,9 @@ def example_of_recording(program: Program) -> str:
     """Return an example of the use of the filter of an IMU."""
     r = program.recording
     vector = (
-        "\n        const strapdown_real magnetometer[3] = {0.0, 20.0, -43.0}; /* any unit */" if r.magnetometer else ""
+        "\n        const strapdown_real magnetometer[3] = {0.0, 20.0, -43.0}; /* any unit */"
+        if r.imu.magnetometer
+        else ""
     )
     return f"""/* The filter over ten seconds of samples. */
 #include <stdio.h>
@@ -268,10 +270,10 @@ static strapdown_filter f;
 
 int main(void) {{
     strapdown_init(&f);
-    for (int k = 0; k * {r.interval!r} < 10.0; k++) {{
+    for (int k = 0; k * {r.imu.interval!r} < 10.0; k++) {{
         const strapdown_real gyro[3] = {{0.0, 0.0, 0.0}}; /* rad/s, body axes: read the sensors here */
         const strapdown_real accelerometer[3] = {{0.0, 0.0, (strapdown_real)9.81}}; /* m/s^2 */{vector}
-        if (strapdown_update(&f, k * {r.interval!r}, gyro, accelerometer{", magnetometer" if r.magnetometer else ""})) {{
+        if (strapdown_update(&f, k * {r.imu.interval!r}, gyro, accelerometer{", magnetometer" if r.imu.magnetometer else ""})) {{
             /* not used: see the status */
         }}
     }}

@@ -76,8 +76,6 @@ def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
         program,
         sensors=tuple(replace(sensor, noise=()) for sensor in program.sensors),
         recording=Recording(
-            magnetometer=live.magnetometer,
-            interval=live.interval,
             parameters=live.parameters,
             imu=imu,
             field=field,

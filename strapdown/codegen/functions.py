@@ -113,6 +113,8 @@ class Function:
         self.trace = Trace()
         self.body = self.block = self.trace.place = Block()
         self.calls = 0
+        self.results = 0
+        """Number of results, if there are several."""
         self.names: dict[str, int] = {}
         self.changing: set[str] = set()
         """Arrays whose elements may change after they are read."""

@@ -439,19 +439,20 @@ class Interpreter:
                 n: len(x) if type(x) is tuple else -len(x) if n == "work" else m.type_of(x) for n, x in passed.items()
             }
             m.define(function, sizes, known)
-        target, size = m.functions[name]
-        if not size:
+        target = m.functions[name]
+        if not target.results:
             result = {"": None, "real": ""}.get(target.returns, target.returns)
             return m.call(name, *passed.values(), result=result)
-        variable, declaration = m.variable(name, (0.0,) * size)
+        variable, declaration = m.variable(name, (0.0,) * target.results)
         m.add(declaration)
         m.call(name, *passed.values(), variable.base)
         return variable.value()
 
-    def trace_function(self, function: FunctionType, arguments: Sequence[Any]) -> int:
-        """Execute a function as the one of the target; return the number of its results, if they are several."""
+    def trace_function(self, function: FunctionType, arguments: Sequence[Any]) -> None:
+        """Execute a function as the one of the target."""
         m, result = self.m, self._body(function, arguments, outer=True)
         if isinstance(result, tuple):
+            m.results = len(result)
             m.parameters = [*m.parameters, ("result", -len(result))]
             out = m.array(lambda i: f"result[{i}]")
             for i, value in enumerate(result):
@@ -460,7 +461,6 @@ class Interpreter:
             m.returns = m.returns or "real"
             m.give(result)
         m.flush()
-        return len(result) if isinstance(result, tuple) else 0
 
 
 def is_number(value: Any) -> bool:

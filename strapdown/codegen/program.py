@@ -216,7 +216,7 @@ def update(f: Any, sensor: Sensor, value: Any, sigma: Any = 0) -> Any:
         return BAD_INPUT
     f.nis[f.program.sensors.index(sensor)] = g.nis
     if f.program.recording is not None:
-        last = f.program.recording.last_innovations(f, sensor)
+        last = f.force_innovation if sensor is f.program.sensors[0] else f.field_innovation
         for i in range(min(len(g.errors), 2)):
             last[0, i] = g.errors[i] / square_root(g.variances[i])
     if f.program.thresholds is not None:

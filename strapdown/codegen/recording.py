@@ -58,9 +58,6 @@ class Array(NamedTuple):
 class Recording:
     """The filter of an IMU in Python: of its arrays, only shapes and constants are used."""
 
-    magnetometer: bool
-    interval: float
-    """Interval of the samples, s."""
     parameters: AhrsParameters
     imu: Imu
     field: headings.Memory
@@ -73,15 +70,10 @@ class Recording:
         arrays = {
             name: getattr(self.imu.arrays, name)
             for name in live_imu.LASTING
-            if self.magnetometer or name not in of_field
+            if self.imu.magnetometer or name not in of_field
         }
-        arrays |= self.field._asdict() if self.magnetometer else {}
+        arrays |= self.field._asdict() if self.imu.magnetometer else {}
         return arrays | (self.rest._asdict() if self.imu.rests else {})
-
-    @staticmethod
-    def last_innovations(f: Any, sensor: body.Sensor) -> Any:
-        """Return the array of the filter ``f`` for the last innovations of a sensor over their σ (1, m)."""
-        return f.force_innovation if sensor is f.program.sensors[0] else f.field_innovation
 
     @property
     def arrays(self) -> tuple[Array, ...]:
@@ -162,13 +154,13 @@ def init(f: Any) -> Any:
         f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
     judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
-    if r.magnetometer:
+    if r.imu.magnetometer:
         judged.append((f.field_density, f.field_averages, r.imu.arrays.field_averages))
     for density, averages, at_start in judged:
         density[0] = regions.FIRST_DENSITY[0]
         for i, value in enumerate(at_start.tolist()):
             averages[i] = value
-    if r.magnetometer:
+    if r.imu.magnetometer:
         for array in (f.counted, f.sums, f.iron, f.total, f.start):
             for i in range(len(array)):
                 array[i] = 0

@@ -30,10 +30,12 @@ OWN: set[Any] = {
 class Target(Function):
     """A function of the filter while it is traced."""
 
-    def __init__(self, program: Program, name: str, parameters: Mapping[str, Any], functions: dict[str, Any]) -> None:
+    def __init__(
+        self, program: Program, name: str, parameters: Mapping[str, Any], functions: dict[str, Target]
+    ) -> None:
         super().__init__(name, list(parameters.items()))
         self.words, self.program, self.functions = "", program, functions
-        """Functions of the target by name, and the number of their results, if there are several."""
+        """Functions of the target by name."""
         helpers: dict[str, Any] = {
             "far_turn": self._far_turn,
             "load": load,
@@ -78,8 +80,8 @@ class Target(Function):
             own["imu"] = m.state.imu
             own["constants"] = (m.state.imu.routines.watch if of_rests else m.state.imu.routines.head).arguments[0]
         arguments = [m.argument(x.arg) if x.arg in sizes else {**known, **own}[x.arg] for x in tree.args.args]
-        size = m.kernel.trace_function(function, arguments)
-        self.functions[name] = m, size
+        m.kernel.trace_function(function, arguments)
+        self.functions[name] = m
 
     def give(self, value: Any, status: str = "") -> None:
         """Return a number, nothing, or a status, which may be known by its bit."""
@@ -147,15 +149,15 @@ def traced(program: Program) -> list[Target]:
         m.define(body.init, {"attitude": 4}, {})
         angle, bias = (math.sqrt(program.covariance[i][i]) for i in (0, 3))
         start = f"Start at an attitude, sigma {angle:.6g} rad = {angle / DEGREE:.4g} deg about each axis"
-        m.functions["init"][0].words = f"{start}, and at zero bias, sigma {bias:.6g} rad/s."
+        m.functions["init"].words = f"{start}, and at zero bias, sigma {bias:.6g} rad/s."
         m.define(body.predict, {"gyro": 3, "dt": 0}, {})
         for sensor in program.sensors:
             m.define(body.update, {"value": sensor.size}, {"sensor": sensor, "sigma": 0})
     else:
         m.define(recording.init, {}, {})
-        sample = {"time": "wide", "gyro": 3, "accelerometer": 3} | ({"magnetometer": 3} if r.magnetometer else {})
+        sample = {"time": "wide", "gyro": 3, "accelerometer": 3} | ({"magnetometer": 3} if r.imu.magnetometer else {})
         m.define(recording.update, sample, {"magnetometer": None})
-    functions = [target for target, _ in m.functions.values()]
-    if r is not None and not r.magnetometer:
+    functions = list(m.functions.values())
+    if r is not None and not r.imu.magnetometer:
         functions[-1].words = functions[-1].words.partition(" magnetometer:")[0]
     return functions
