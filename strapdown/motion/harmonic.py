@@ -183,12 +183,10 @@ class HarmonicRates:
 
     def _node_phases(self, nodes: Array) -> tuple[Array, Array]:
         """Return cosines and sines of the phases at the nodes, (n, harmonics) each."""
-        phases = [cosine_sine((h.rate, 0.0), nodes, h.phase) for h in self.harmonics]
-        empty = np.empty((len(nodes), 0))
-        return (
-            np.stack([c for c, _ in phases], axis=-1) if phases else empty,
-            np.stack([s for _, s in phases], axis=-1) if phases else empty,
-        )
+        phases = np.empty((2, len(nodes), len(self.harmonics)))
+        for k, h in enumerate(self.harmonics):
+            phases[:, :, k] = cosine_sine((h.rate, 0.0), nodes, h.phase)
+        return phases[0], phases[1]
 
 
 def _grown(nodes: float) -> int:

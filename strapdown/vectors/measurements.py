@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import quaternion
+from strapdown import checks, quaternion
 from strapdown.checks import ROUNDING, Array, InputError, array, increasing, instance, numbers, one_of, unit_quaternions
 from strapdown.results import ByValue
 
@@ -323,12 +323,8 @@ def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Ar
         whole = np.broadcast_to(sample, (m, 3, 3))
     else:
         sample = whole = _of_known(name, array(name, own, (m, 3, 3), allow_nan=True), missing, _mean_covariance)
-    size = np.einsum("kii->k", np.abs(sample))[:, None, None]
-    lopsided = np.any(np.abs(sample - np.swapaxes(sample, 1, 2)) > 1e-12 * size, axis=(1, 2))
-    if lopsided.any():
-        raise InputError(f"{name}[{int(np.argmax(lopsided))}] is not symmetric; use ½(C + Cᵀ)")
-    least = np.linalg.eigvalsh(sample)[:, 0] if len(sample) else np.zeros(0)
-    if np.any(least < -1e-12 * size.ravel()):
+    least = np.linalg.eigvalsh(checks.symmetric(name, sample))[:, 0] if len(sample) else np.zeros(0)
+    if np.any(least < -1e-12 * np.trace(sample, axis1=1, axis2=2)):
         k = int(np.argmin(least))
         raise InputError(
             f"{name}[{k}] has the eigenvalue {least[k]:.3g}; a covariance must have no negative eigenvalue"
