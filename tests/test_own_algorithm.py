@@ -22,6 +22,10 @@ IGNAGNI = coning.read_algorithms(EXAMPLES / "ignagni-1996.toml")
 MILLER = coning.named(str(EXAMPLES / "miller-1983.toml"))
 
 
+def of_coefficients(coefficients, **fields):
+    return Algorithm.from_table({"name": "own", "coefficients": coefficients, **fields})
+
+
 @pytest.mark.parametrize("own", IGNAGNI, ids=lambda algorithm: algorithm.name)
 def test_ignagnis_table_is_the_closed_form_and_drifts_as_he_says(own):
     m = own.samples
@@ -44,15 +48,17 @@ def test_textbook_order_is_that_of_the_increments():
     """φ = Σ Δθ + (c_1 Δθ_1 + c_2 Δθ_2) × Δθ_3, each coefficient alone, with and without increments of the step before."""
     rng = np.random.default_rng(1)
     a, b, c = increments = 1e-2 * rng.standard_normal((3, 3))
-    own = Algorithm.from_coefficients("own", [0.3, 0.7])
+    own = of_coefficients([0.3, 0.7])
     by_hand = a + b + c + np.cross(0.3 * a + 0.7 * b, c)
     np.testing.assert_allclose(coning.rotation_vectors(increments, own)[0], by_hand, rtol=0, atol=2e-17)
-    late = Algorithm.from_coefficients("late", [0.3, 0.7], previous=1)
+    late = of_coefficients([0.3, 0.7], previous=1)
     assert (late.samples, late.previous) == (2, 1)
     d, e = 1e-2 * rng.standard_normal((2, 3))
     vectors = coning.rotation_vectors(np.array([a, b, c, d]), late)
     np.testing.assert_allclose(vectors[1], c + d + np.cross(0.3 * b + 0.7 * c, d), rtol=0, atol=2e-17)
-    pairs = Algorithm.from_products("pairs", 1, [(2, 1, 0.5), (1, 3, 0.25)], previous=1, following=1)
+    pairs = Algorithm.from_table(
+        {"name": "pairs", "samples": 1, "products": [(2, 1, 0.5), (1, 3, 0.25)], "previous": 1, "following": 1}
+    )
     vectors = coning.rotation_vectors(np.array([a, b, c, d, e]), pairs)
     np.testing.assert_allclose(vectors[2], c + 0.5 * np.cross(c, b) + 0.25 * np.cross(b, d), rtol=0, atol=2e-17)
 
@@ -67,7 +73,7 @@ def test_derived_orders_are_those_of_the_catalogue():
     assert compared > 30
 
 
-OWN = [Algorithm.from_coefficients("own", c) for c in ([], ["1/2"], ["2/3"], ["9/20", "27/20"], ["1/20", "27/20"])]
+OWN = [of_coefficients(c) for c in ([], ["1/2"], ["2/3"], ["9/20", "27/20"], ["1/20", "27/20"])]
 
 
 @pytest.mark.parametrize(("own", "order"), list(zip([*OWN, MILLER], (2, 2, 4, 3, 2, 4), strict=True)))
@@ -92,7 +98,7 @@ def test_the_order_of_convergence_shows_over_a_manoeuvre(own, order):
 
 
 def test_the_derived_constant_is_what_integration_drifts_by():
-    own = Algorithm.from_coefficients("own", ["1/2", "13/10"])
+    own = of_coefficients(["1/2", "13/10"])
     cone = motion.Coning(angle=0.1 * DEGREE, frequency=0.5)
     predicted = coning.predicted_coning_drift(own, cone.angle, cone.frequency, 0.01)
     assert own.drift_order == 2
@@ -142,13 +148,13 @@ def test_every_command_takes_a_file_for_a_name():
         ('name = "x"\ncoefficients = ["two"]', "fraction in quotes"),
         ('name = "x"\ncoefficients = [true]', "is True"),
         ('name = "x"\ncoefficients = "2/3"', "is no list"),
-        ('name = "x"\nsamples = 3\ncoefficients = ["2/3"]', "need samples 2"),
-        ('name = "x"\nfollowing = 1\ncoefficients = ["2/3"]', "following 0"),
-        ('name = "x"\nprevious = 2\ncoefficients = ["2/3"]', "leave no increment"),
+        ('name = "x"\nsamples = 3\ncoefficients = ["2/3"]', "make samples 2"),
+        ('name = "x"\nfollowing = 1\ncoefficients = ["2/3"]', "and following 0"),
+        ('name = "x"\nprevious = 2\ncoefficients = ["2/3"]', "make samples 0"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 1, 0.5]]', "two different increments"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 3, 0.5]]', "increments of 1 … 2"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 2]]', r"give \(i, j, K\)"),
-        ('name = "x"\nproducts = [[1, 2, 0.5]]', "samples is missing"),
+        ('name = "x"\nproducts = [[1, 2, 0.5]]', "samples is None"),
         ('name = "x"\nsample = 2\ncoefficients = []', "sample"),
         ('coefficients = ["2/3"]', "name is missing"),
         ('name = "two-sample"\ncoefficients = ["2/3"]', "built-in"),

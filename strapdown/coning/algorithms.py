@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from numbers import Rational
@@ -28,9 +28,6 @@ SOLVERS = {
     "euler": "first-order update of the quaternion, normalised",
 }
 """Methods by which the rotation of a step is computed from its increments."""
-
-Coefficient = int | float | str | Fraction
-"""Types of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
 
 
 def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
@@ -103,123 +100,18 @@ class Algorithm:
             raise InputError(f"{self.name}: the products of solver {self.solver!r} are given by its increments alone")
 
     @classmethod
-    def from_coefficients(
-        cls, name: str, coefficients: Sequence[Coefficient], *, previous: int = 0, source: str = ""
-    ) -> Algorithm:
-        """Return the algorithm ``φ = Σ Δθ_i + (c_1 Δθ_1 + … + c_{M−1} Δθ_{M−1}) × Δθ_M``.
-
-        Parameters
-        ----------
-        name : str
-            Name of the algorithm.
-        coefficients : sequence of int, float, str or Fraction
-            c_1 … c_{M−1}, that of the oldest increment first, as in textbooks (the field ``coefficients`` has the opposite order).
-            M = N + p. A float is converted to a simple fraction (:func:`strapdown.coning.coefficients.rational`).
-        previous : int, default 0
-            p, increments before the step; the sum Σ Δθ_i is that of the N others.
-        source : str, default ""
-            Publication.
-
-        Returns
-        -------
-        Algorithm
-            The algorithm, its orders and drift constant derived.
-
-        Examples
-        --------
-        >>> own = Algorithm.from_coefficients("ignagni-3", ["9/20", "27/20"])
-        >>> own.samples, own.order, own.drift_order, str(own.drift_constant)
-        (3, 3, 6, '1/280')
-        """
-        rationals = _rationals(f"{name}: coefficients", coefficients)
-        checks.count(f"{name}: previous", previous, minimum=0)
-        samples = len(rationals) + 1 - previous
-        if samples < 1:
-            raise InputError(
-                f"{name}: {len(rationals)} coefficients with previous {previous} leave no increment in the step; give at least {previous}"
-            )
-        table = _with_last(rationals)
-        return cls(
-            name=name,
-            solver="compressed",
-            samples=samples,
-            previous=previous,
-            products=table,
-            source=source,
-            order=exact.second_order(table, samples, previous),
-        )
-
-    @classmethod
-    def from_products(
-        cls,
-        name: str,
-        samples: int,
-        products: Iterable[tuple[int, int, Coefficient]],
-        *,
-        previous: int = 0,
-        following: int = 0,
-        source: str = "",
-    ) -> Algorithm:
-        """Return the algorithm ``φ = Σ Δθ_i + Σ K_ij Δθ_i × Δθ_j``.
-
-        Parameters
-        ----------
-        name : str
-            Name of the algorithm.
-        samples : int
-            N, number of increments in a step.
-        products : iterable of (i, j, K_ij)
-            Increments are counted from 1, the oldest of the window; i ≠ j. Types of K_ij as in :meth:`from_coefficients`.
-        previous, following : int, default 0
-            Number of increments of the window before and after the step.
-        source : str, default ""
-            Publication.
-
-        Returns
-        -------
-        Algorithm
-            The algorithm, its orders and drift constant derived.
-
-        Examples
-        --------
-        >>> own = Algorithm.from_products("miller-3", 3, [(1, 3, "9/20"), (1, 2, "27/40"), (2, 3, "27/40")])
-        >>> own.order, own.drift_order, str(own.drift_constant)
-        (4, 6, '1/280')
-        """
-        for what, number, least in (("samples", samples, 1), ("previous", previous, 0), ("following", following, 0)):
-            checks.count(f"{name}: {what}", number, minimum=least)
-        window = samples + previous + following
-        table = [[Fraction(0)] * window for _ in range(window)]
-        for k, entry in enumerate(products):
-            place = f"{name}: products[{k}]"
-            if not isinstance(entry, Sequence) or isinstance(entry, str) or len(entry) != 3:
-                raise InputError(f"{place} is {entry!r}; give (i, j, K), the coefficient K of Δθ_i × Δθ_j")
-            i, j = (checks.count(place, index) for index in entry[:2])
-            if i == j or max(i, j) > window:
-                raise InputError(f"{place} is of Δθ_{i} × Δθ_{j}; give two different increments of 1 … {window}")
-            (value,) = _rationals(place, entry[2:])
-            table[i - 1][j - 1] += value
-            table[j - 1][i - 1] -= value
-        pairs = tuple(map(tuple, table))
-        return cls(
-            name=name,
-            solver="pairs",
-            samples=samples,
-            previous=previous,
-            following=following,
-            products=pairs,
-            source=source,
-            order=exact.second_order(pairs, samples, previous),
-        )
-
-    @classmethod
     def from_table(cls, table: Mapping[str, Any], place: str = "algorithm") -> Algorithm:
-        """Return the algorithm defined by a table of a file.
+        """Return an algorithm of your own from a table, such as that of a file; its orders and its drift constant are derived.
 
         Parameters
         ----------
         table : mapping of str
-            Arguments of :meth:`from_coefficients` or :meth:`from_products` by name.
+            ``name``, and either ``coefficients``: [c_1, …, c_{M−1}] of ``φ = Σ Δθ_i + (c_1 Δθ_1 + … + c_{M−1} Δθ_{M−1}) × Δθ_M``, that of
+            the oldest increment first, as in textbooks (the property ``coefficients`` has the opposite order). Or ``products``:
+            [[i, j, K_ij], …] of ``φ = Σ Δθ_i + Σ K_ij Δθ_i × Δθ_j``, increments counted from 1, the oldest of the window, with ``samples``,
+            the number N of increments in a step. Optional: ``previous`` and, with products, ``following``, the numbers of increments of
+            the window before and after the step; ``source``, the publication. Coefficients are numbers, fractions or text such as "27/20";
+            a float is converted to a simple fraction (:func:`strapdown.coning.coefficients.rational`).
         place : str, default "algorithm"
             Name of the table, for error messages.
 
@@ -227,6 +119,15 @@ class Algorithm:
         -------
         Algorithm
             The algorithm.
+
+        Examples
+        --------
+        >>> own = Algorithm.from_table({"name": "ignagni-3", "coefficients": ["9/20", "27/20"]})
+        >>> own.samples, own.order, own.drift_order, str(own.drift_constant)
+        (3, 3, 6, '1/280')
+        >>> miller = [(1, 3, "9/20"), (1, 2, "27/40"), (2, 3, "27/40")]
+        >>> Algorithm.from_table({"name": "miller-3", "samples": 3, "products": miller}).order
+        4
         """
         checks.known_keys(
             place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
@@ -237,23 +138,34 @@ class Algorithm:
             raise InputError(
                 f"{place}: give either coefficients, [c_1, …] of (Σ c_i Δθ_i) × Δθ_M, or products, [[i, j, K], …] of K Δθ_i × Δθ_j"
             )
-        rest = dict(table)
-        form = "products" if "products" in rest else "coefficients"
-        entries = rest.pop(form)
-        if not isinstance(entries, list):
-            raise InputError(f"{place}: {entries!r} is no list; write numbers, or fractions in quotes, in brackets")
+        form = "products" if "products" in table else "coefficients"
+        if not isinstance(table[form], list):
+            raise InputError(f"{place}: {table[form]!r} is no list; write numbers, or fractions in quotes, in brackets")
+        previous, following = (
+            checks.count(f"{place}: {name}", table.get(name, 0), minimum=0) for name in ("previous", "following")
+        )
         if form == "products":
-            if "samples" not in rest:
-                raise InputError(f"{place}: samples is missing; give the number of increments in a step")
-            return cls.from_products(products=entries, **rest)
-        samples, following = rest.pop("samples", None), rest.pop("following", 0)
-        algorithm = cls.from_coefficients(coefficients=entries, **rest)
-        if following or samples not in (None, algorithm.samples):
-            raise InputError(
-                f"{place}: {len(entries)} coefficients and previous {algorithm.previous} need samples {algorithm.samples} and following 0; "
-                "for another step give products"
-            )
-        return algorithm
+            samples = checks.count(f"{place}: samples", table.get("samples"))  # type: ignore[arg-type]
+            products = _pair_table(f"{place}: products", table[form], samples + previous + following)
+        else:
+            rationals = _rationals(f"{place}: coefficients", table[form])
+            samples = len(rationals) + 1 - previous
+            if samples < 1 or following or table.get("samples", samples) != samples:
+                raise InputError(
+                    f"{place}: {len(rationals)} coefficients and previous {previous} make samples {samples}, which must be 1 or more, and "
+                    "following 0; for another step give products"
+                )
+            products = _with_last(rationals)
+        return cls(
+            name=table["name"],
+            solver="pairs" if form == "products" else "compressed",
+            samples=samples,
+            previous=previous,
+            following=following,
+            products=products,
+            source=table.get("source", ""),
+            order=exact.second_order(products, samples, previous),
+        )
 
     def to_table(self) -> dict[str, Any]:
         """Return the algorithm as a table for :meth:`from_table`.
@@ -343,7 +255,23 @@ def _with_last(coefficients: Rationals) -> Table:
     return exact.outer_pairs((*coefficients, Fraction(0)), (*[Fraction(0)] * len(coefficients), Fraction(1)))
 
 
-def _rationals(place: str, values: Iterable[Coefficient]) -> Rationals:
+def _pair_table(place: str, products: Sequence[Any], window: int) -> Table:
+    """Return the pair table of products (i, j, K) of the increments 1 … ``window``."""
+    table = [[Fraction(0)] * window for _ in range(window)]
+    for k, entry in enumerate(products):
+        here = f"{place}[{k}]"
+        if not isinstance(entry, Sequence) or isinstance(entry, str) or len(entry) != 3:
+            raise InputError(f"{here} is {entry!r}; give (i, j, K), the coefficient K of Δθ_i × Δθ_j")
+        i, j = (checks.count(here, index) for index in entry[:2])
+        if i == j or max(i, j) > window:
+            raise InputError(f"{here} is of Δθ_{i} × Δθ_{j}; give two different increments of 1 … {window}")
+        (value,) = _rationals(here, entry[2:])
+        table[i - 1][j - 1] += value
+        table[j - 1][i - 1] -= value
+    return tuple(map(tuple, table))
+
+
+def _rationals(place: str, values: Sequence[Any]) -> Rationals:
     rationals = []
     for k, value in enumerate(values):
         try:
