@@ -448,6 +448,15 @@ def test_a_gate_is_exported_without_its_recovery(tmp_path):
     assert "recovery = 0" in other[0]
 
 
+@pytest.mark.parametrize("name", ["states", "OK", "f", "int"])
+def test_a_sensor_may_have_a_name_that_the_files_use(name, tmp_path):
+    _, setup, _ = case("precise")
+    sd.export(setup, [dataclasses.replace(SENSORS["level"], name=name)], folder=tmp_path)
+    build = [compiler(), *STRICT, "main.c", "strapdown_filter.c", "-o", "run", "-lm"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_refusals_of_arguments(tmp_path):
     record, setup, _ = case("precise")
     for arguments, words in (

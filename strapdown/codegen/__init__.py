@@ -145,8 +145,6 @@ def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | V
         return ()
     if isinstance(sensors, ImuRecord):
         return sensors.vectors
-    if isinstance(sensors, VectorSensor | VectorMeasurements):
-        return [sensors]
     if isinstance(sensors, Sequence):
         return sensors
     from strapdown.scenarios import Scenario, simulate

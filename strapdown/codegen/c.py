@@ -8,7 +8,7 @@ import textwrap
 
 import numpy as np
 
-from strapdown.codegen.program import Program, Sensor, place
+from strapdown.codegen.program import MEANINGS, Program, Sensor, place
 from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 
@@ -317,7 +317,17 @@ def files(program: Program, functions: list[Target], origin: str, *, single: boo
     }
 
 
+WORDS_OF_C = (
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return "
+    "short signed sizeof static struct switch typedef union unsigned void volatile while"
+)
+EXAMPLE = ("f", "k", "gyro", "start")
+"""Variables of the example."""
+RESERVED = {"status", "states", *map(str.lower, MEANINGS), *EXAMPLE, *WORDS_OF_C.split()}
+"""Names that a sensor cannot have."""
+
+
 def identifier(name: str) -> str:
     """Return a sensor's name as an identifier."""
     text = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower()
-    return text if text and not text[0].isdigit() else f"sensor_{text}"
+    return text if text and not text[0].isdigit() and text not in RESERVED else f"sensor_{text}"

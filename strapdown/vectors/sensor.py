@@ -112,7 +112,7 @@ class Faults:
             compiled(gyro_errors.gauss_markov)(decay, np.sqrt(1.0 - decay**2)[:, None] * drive[1:], correlated)
         return white, correlated
 
-    def _heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
+    def _received(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
         """Return the series without the samples in outages, off duty or lost, with arrival times if there is a latency.
 
         Lost samples are drawn from a child of the generator, so they do not depend on the noise.
@@ -170,7 +170,7 @@ class Sampled(ByValue):
         time = sample_times(self.rate, self.phase, start, end)
         white, correlated = self.faults._noise(time, generator)
         measured = self._measured(motion, time, white, correlated)
-        return self.faults._heard(VectorMeasurements(sensor=self.name, time=time, **measured), generator)
+        return self.faults._received(VectorMeasurements(sensor=self.name, time=time, **measured), generator)
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         """Return the fields of the series of measurements, from white noise of unit σ and correlated noise (m, 3)."""
