@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import math
+import operator
 from collections.abc import Callable, Mapping
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -122,23 +123,16 @@ def broadcast(x: Any) -> Eight:
     return Eight([x] * 8)
 
 
+def elementwise(operation: Callable[[Any, Any], Any]) -> Callable[[Eight, Any], Any]:
+    """Return the method of an operation on eight numbers, with eight others or with one."""
+    return lambda self, other: Eight(map(operation, self, other if isinstance(other, Eight) else [other] * 8))
+
+
 class Eight(list[Any]):
     """Eight numbers, which a kernel treats as one value."""
 
-    def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Eight:
-        return Eight(
-            [operation(a, b) for a, b in zip(self, other if isinstance(other, Eight) else [other] * 8, strict=True)]
-        )
-
-    def __add__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a + b)
-
-    __radd__ = __add__
-
-    def __mul__(self, other: Any) -> Any:
-        return self._with(other, lambda a, b: a * b)
-
-    __rmul__ = __mul__
+    __add__ = __radd__ = elementwise(operator.add)
+    __mul__ = __rmul__ = elementwise(operator.mul)
 
 
 def traced(program: Program) -> list[Target]:
