@@ -229,15 +229,6 @@ def test_increments_are_integrals_of_the_body_rate(truth):
 
 
 @every_motion
-def test_increments_add_up(truth):
-    fine = np.linspace(*RECORD, 1025)
-    parts, whole = truth.increments(fine), truth.increments(fine[::64])
-    sums = parts.reshape(-1, 64, 3).sum(axis=1)
-    assert np.abs(sums - whole).max() <= 1e-14 * rate_scale(truth) * (fine[64] - fine[0])
-    assert np.abs(truth.increments(RECORD)[0] - whole.sum(axis=0)).max() <= 1e-14 * rate_scale(truth) * 2.0
-
-
-@every_motion
 def test_short_increments_keep_their_digits(truth):
     """A nanosecond: the increment is rate × time to 1e-13 of itself; a difference of attitudes would keep seven digits."""
     t = smooth_times(truth, 12)

@@ -62,9 +62,7 @@ class Member(Values):
             return super().__getitem__(int(place))
         self.function.flush()
         self.loads += 1
-        value = self.trace.symbol("at", self.base, place, (id(self), self.loads))
-        value.type = self.type
-        return value
+        return self.trace.pinned("at", self.type, self.base, place, (id(self), self.loads))
 
     def __setitem__(self, index: Any, value: Any) -> None:
         place = self._place(index)
@@ -129,9 +127,7 @@ class Function:
         """Return a parameter: a symbol, a tuple of them, or an array that the function writes."""
         size = dict(self.parameters)[name]
         if isinstance(size, str):
-            number = self.trace.symbol("parameter", name)
-            number.type = size
-            return number
+            return self.trace.pinned("parameter", size, name)
         if size < 0:
             return Member(self, name, (-size,))
         if size:
@@ -212,10 +208,7 @@ class Function:
         """Call another function of the filter with numbers, tuples of them and local arrays; ``result``: type of its result."""
         self.flush()
         self.calls += 1
-        value = None
-        if result is not None:
-            value = self.trace.symbol("result", name, self.calls)
-            value.type = result
+        value = None if result is None else self.trace.pinned("result", result, name, self.calls)
         values = [x.base if isinstance(x, Member) else x for x in arguments]
         self.add(Statement("call", name, values=values, result=value))
         for array in self.trace.arrays:

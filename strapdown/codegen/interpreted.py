@@ -387,8 +387,7 @@ class Interpreter:
         assert isinstance(node.target, ast.Name)
         name = self.m.new_name(node.target.id.strip("_") or "i")
         statement = Statement("for", name, values=(values.start, values.stop))
-        counter = self.trace.symbol("parameter", name)
-        counter.type = "int"
+        counter = self.trace.pinned("parameter", "int", name)
         self._loop(statement, [], node.body, env, (node.target.id, counter))
 
     def _loop(

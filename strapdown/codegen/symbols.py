@@ -122,6 +122,12 @@ class Trace:
             known = self.symbols[key] = Symbol(self, kind, operands, result, self.count(), self.run)
         return known
 
+    def pinned(self, kind: str, result: str, *operands: Any) -> Symbol:
+        """Return a symbol that stays in its block (:data:`PINNED`), of a type."""
+        symbol = self.symbol(kind, *operands)
+        symbol.type = result
+        return symbol
+
     def sum(self, a: Any, b: Any) -> Any:
         """Return a + b."""
         if not isinstance(a, Symbol) and a == 0:
@@ -180,8 +186,7 @@ class Values:
                 raise KeyError(f"element {i} is read before it is written")
             if i not in self.loaded:
                 self.loads += 1
-                self.loaded[i] = self.trace.symbol("load", self.name(i), (id(self), self.loads))
-                self.loaded[i].type = self.type
+                self.loaded[i] = self.trace.pinned("load", self.type, self.name(i), (id(self), self.loads))
             self.known[i] = self.loaded[i]
         return self.known[i]
 
