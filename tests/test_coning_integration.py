@@ -12,7 +12,7 @@ import pytest
 from measured import turn_to, waves
 
 from sims.coning_algorithms import exact_step, polynomial_step
-from strapdown import coning, kinematics, motion, quaternion
+from strapdown import coning, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.coning import ALGORITHMS
 from strapdown.coning import coefficients as exact
@@ -82,32 +82,6 @@ def test_constant_rate_is_exact():
             coning.integrate(spin.increments(t), algorithm), spin.attitude(t)[:: algorithm.samples]
         ).max()
         assert error < (2e-13 if name == "matched-4-11" else 5e-14), name
-
-
-@pytest.mark.parametrize(
-    "name", ["one-sample", "three-sample", "time-taylor-4", "magnus-6", "polynomial-3", "matched-4-11"]
-)
-def test_fixed_frame_rates(name):
-    # Equation (3) with a fixed-frame rate; the body rates of the inverse motion, reversed, are the independent reference.
-    generator = np.random.default_rng(3)
-    increments = 0.05 * generator.standard_normal((120, 3))
-    initial = quaternion.exp(np.array([0.3, -1.0, 0.4]))
-    attitude = coning.integrate(increments, name, initial, frame="fixed")
-    fine = motion.SpinCone(precession_rate=1.3, spin_rate=0.8, angle=0.4)
-    t = np.linspace(0.0, 3.0, 121)
-    nodes, weights = np.polynomial.legendre.leggauss(12)
-    middles, half = 0.5 * (t[1:] + t[:-1]), 0.5 * (t[1] - t[0])
-    rate = lambda t: kinematics.body_to_fixed_rate(fine.attitude(t), fine.body_rate(t))  # noqa: E731
-    fixed_increments = sum(w * half * rate(middles + half * x) for x, w in zip(nodes, weights, strict=True))
-    estimate = coning.integrate(fixed_increments, name, fine.attitude(0.0), frame="fixed")
-    one_sample = angle_errors(
-        coning.integrate(fixed_increments, "one-sample", fine.attitude(0.0), frame="fixed"), fine.attitude(t)
-    ).max()
-    error = angle_errors(estimate, fine.attitude(t)[:: ALGORITHMS[name].samples]).max()
-    assert error < (1.01 * one_sample if name == "one-sample" else 0.1 * one_sample)
-    # Its conjugate is the body-frame integration of the negated increments.
-    mirrored = coning.integrate(-increments, name, quaternion.conjugate(initial))
-    np.testing.assert_allclose(attitude, quaternion.conjugate(mirrored), atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ["one-sample", "four-sample", "polynomial-3"])
@@ -401,7 +375,6 @@ def test_rate_samples_cost_what_the_docstring_says():
         (coning.integrate, (np.zeros((1, 3)), "two-samples"), "did you mean 'two-sample'"),
         (coning.integrate, (np.zeros((1, 3)), "one-sample", (2.0, 0.0, 0.0, 0.0)), "norm 2"),
         (coning.integrate, (np.zeros((1, 3)), "one-sample", np.eye(4)), "initial_attitude has shape"),
-        (functools.partial(coning.integrate, frame="fixd"), (np.zeros((1, 3)),), "did you mean 'fixed'"),
         (coning.increments_from_rates, (np.zeros((5, 3)), 0.1, 3), "even"),
         (coning.increments_from_rates, (np.zeros((1, 3)), 0.1), "at least 2"),
         (coning.increments_from_rates, (np.zeros((5, 3)), 0.0), "sample_interval"),

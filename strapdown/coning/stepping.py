@@ -44,7 +44,6 @@ def integrate(
     algorithm: str | Algorithm = "one-sample",
     initial_attitude: ArrayLike = IDENTITY,
     *,
-    frame: str = "body",
     edges: ArrayLike | None = None,
 ) -> Array:
     """Return the attitude at the step edges from gyro increments.
@@ -52,13 +51,11 @@ def integrate(
     Parameters
     ----------
     increments : array_like (n, 3)
-        Integrals of the rate over each sample interval, rad, axes by ``frame``; the last n mod N increments are not used.
+        Integrals of the body rate over each sample interval, rad; the last n mod N increments are not used.
     algorithm : str or Algorithm, default "one-sample"
         Name in :data:`ALGORITHMS`, or an algorithm.
     initial_attitude : array_like (4,), default identity
         Unit quaternion q_fb at the first edge.
-    frame : {"body", "fixed"}, default "body"
-        Axes of the increments: body rates, equation (17), or fixed-frame rates, equation (3) of *Quaternion differentiation*.
     edges : array_like (n + 1,), optional
         Times of the edges of the sample intervals, s, as in :func:`rotation_vectors`. Default: equal intervals.
 
@@ -68,16 +65,11 @@ def integrate(
         Unit quaternions q_fb, starting with the initial attitude.
     """
     table = named(algorithm)
-    checks.one_of("frame", frame, ("body", "fixed"))
     initial = checks.unit_quaternions("initial_attitude", initial_attitude)
     if initial.shape != (4,):
         raise InputError(f"initial_attitude has shape {initial.shape}, wanted (4,); pass one quaternion")
     late = table.window == 1 and _is_plain(increments)
     samples = np.asarray(increments) if late else _increments(increments)
-    if frame == "fixed":
-        # The conjugate of equation (3) is equation (17) for q* and −w.
-        samples = -samples
-        initial = quaternion.conjugate(initial)
     attitude = np.empty((len(samples) // table.samples + 1, 4))
     work = np.empty(WORK)
     uneven, corrected = _uneven(samples, edges, table)
@@ -95,7 +87,7 @@ def integrate(
         # A value that is not finite makes all later attitudes NaN, so plain arrays need not be searched before.
         _increments(increments)
         raise InputError("increments holds a rotation vector of more than 1e150 rad; check its unit")
-    return quaternion.conjugate(attitude) if frame == "fixed" else attitude
+    return attitude
 
 
 def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int = 2) -> Array:
