@@ -412,6 +412,7 @@ def test_a_pair_table_over_a_window_keeps_its_order_up_to_both_ends(previous, fo
         order=4,
         products=exact.taylor_pairs(n, previous, following),
     )
+    assert exact.second_order(table.products, n, previous) == 4
     for length in (n, n + 1, table.window, table.window + 1, 4 * table.window + 1):
         c = quadratic if length > 2 else np.zeros(3)
         t = np.arange(length + 1.0)[:, None]
