@@ -18,7 +18,7 @@ from strapdown.vectors.attitude_sensor import AttitudeSensor
 from strapdown.vectors.heading_pair import HeadingPair
 from strapdown.vectors.horizon_sensor import HorizonSensor
 from strapdown.vectors.magnetometer import Magnetometer
-from strapdown.vectors.measurements import KINDS, VectorMeasurements, need_level, need_unit, triad
+from strapdown.vectors.measurements import KINDS, VectorMeasurements, need_level, triad
 from strapdown.vectors.sensor import Faults, Sensor, without_noise
 from strapdown.vectors.vector_sensor import VectorSensor
 

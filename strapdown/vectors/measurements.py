@@ -90,7 +90,7 @@ class VectorMeasurements(ByValue):
                 raise InputError(f"{self.sensor}: attitude belongs to kind 'attitude', not {self.kind!r}")
             vector = array(f"{self.sensor}: vector_b", self.vector_b, (m, 3), allow_nan=True)
             if self.kind != "vector":
-                need_unit(f"{self.sensor}: vector_b", vector)
+                _need_unit(f"{self.sensor}: vector_b", vector)
             missing = _missing(vector)
             store["vector_b"] = vector
         store.update(self._noise(m, missing))
@@ -338,15 +338,14 @@ MIN_LEVEL = 1e-3
 """Minimum horizontal part of a unit reference of a heading."""
 
 
-def need_unit(name: str, vector: Array) -> None:
-    """Reject measured vectors (..., 3) that are not of unit length, except missing ones (NaN)."""
-    norm = np.linalg.norm(vector, axis=-1)
+def _need_unit(name: str, vector: Array) -> None:
+    """Reject measured vectors (m, 3) that are not of unit length, except missing ones (NaN)."""
+    norm = np.linalg.norm(vector, axis=1)
     bad = np.abs(norm - 1.0) > UNIT_TOLERANCE
     if np.any(bad):
         k = int(np.argmax(bad))
-        place = f"{name}[{k}]" if bad.ndim else name
         raise InputError(
-            f"{place} has length {np.ravel(norm)[k]:.6g}; divide each vector by its length (missing ones are NaN)"
+            f"{name}[{k}] has length {norm[k]:.6g}; divide each vector by its length (missing ones are NaN)"
         )
 
 
