@@ -299,15 +299,11 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
     with reading.from_file(path):
         content = reading.toml(path)
         checks.known_keys(f"{path}", content, ("algorithm",))
-        tables = content.get("algorithm")
-        several = isinstance(tables, list)
-        entries = [
-            (f"{path}: algorithm" + (f"[{k}]" if several else ""), table)
-            for k, table in enumerate(tables if isinstance(tables, list) else [tables])
-        ]
-        if not entries or not all(isinstance(table, Mapping) for _, table in entries):
+        tables: Any = content.get("algorithm")
+        entries = {f"[{k}]": table for k, table in enumerate(tables)} if isinstance(tables, list) else {"": tables}
+        if not entries or not all(isinstance(table, Mapping) for table in entries.values()):
             raise InputError(f"{path} has no table [algorithm]; add one with name, and coefficients or products")
-        algorithms = tuple(Algorithm.from_table(table, place) for place, table in entries)
+        algorithms = tuple(Algorithm.from_table(table, f"{path}: algorithm{k}") for k, table in entries.items())
     names = [algorithm.name for algorithm in algorithms]
     for algorithm in algorithms:
         if names.count(algorithm.name) > 1:
@@ -322,16 +318,14 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
 
 def compressed(samples: int, previous: int = 0) -> Algorithm:
     """Return the coning-optimal compressed algorithm with N samples and p samples of the previous step."""
-    m = samples + previous
+    products = _with_last(tuple(reversed(exact.compressed_coefficients(samples, previous))))
     return Algorithm(
         name=f"{_NUMBERS[samples - 1]}-sample" + (f"-previous-{previous}" if previous else ""),
         solver="compressed",
         samples=samples,
         previous=previous,
-        # One lag-symmetric cross product is optimal for coning. For general motion it is exact for linear rates only; two samples gain an
-        # order by symmetry.
-        order=2 if m == 1 else 4 if (samples, previous) == (2, 0) else 3,
-        products=_with_last(tuple(reversed(exact.compressed_coefficients(samples, previous)))),
+        order=exact.second_order(products, samples, previous),
+        products=products,
         source="Miller 1983; Ignagni 1996; Savage 2010",
     )
 
@@ -398,13 +392,10 @@ class Catalogue(Mapping[str, Algorithm]):
     """Algorithms by name, each constructed and checked on first use, so that the import is fast."""
 
     def __init__(self, makers: dict[str, Callable[[], Algorithm]]) -> None:
-        self._makers = makers
-        self._made: dict[str, Algorithm] = {}
+        self._makers = {name: functools.cache(make) for name, make in makers.items()}
 
     def __getitem__(self, name: str) -> Algorithm:
-        if name not in self._made:
-            self._made[name] = self._makers[name]()
-        return self._made[name]
+        return self._makers[name]()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._makers)
