@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from strapdown import coning
 from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.live import arrays_of
 from strapdown.checks import Array, InputError
@@ -33,7 +34,10 @@ MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
 
 def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements], *, single: bool) -> Program:
     """Return the program of a setup for these sensors."""
-    _need_exportable(setup)
+    one_sample = setup.integration == coning.ALGORITHMS["one-sample"]
+    refuse(
+        EXPORTED, estimator=setup.estimator_name != "mekf", robust=setup.robust is not None, integration=not one_sample
+    )
     series = _series(setup, sensors)
     kinds: Mapping[str, Any] = {vectors.sensor: vectors.kind for vectors in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
@@ -81,16 +85,6 @@ def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
             field=field,
             rest=rest,
         ),
-    )
-
-
-def _need_exportable(setup: FilterSetup) -> None:
-    """Refuse what the exported filter does not have."""
-    refuse(f"the estimator is {setup.estimator_name}, but {EXPORTED}", estimator=setup.estimator_name != "mekf")
-    refuse(EXPORTED, robust=setup.robust is not None)
-    refuse(
-        f"the integration is {setup.integration.name}, but {EXPORTED}",
-        integration=setup.integration.samples != 1 or setup.integration.name != "one-sample",
     )
 
 
