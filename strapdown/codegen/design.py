@@ -94,12 +94,8 @@ def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasureme
         raise InputError("there is no sensor; give the sensors, a record, or a scenario with sensors")
     for sensor in sensors:
         if isinstance(sensor, VectorMeasurements) and len(sensor.time):
-            for name, values in (
-                ("sigma", sensor.sigma),
-                ("reference_f", sensor.references_f),
-                ("covariance", sensor.covariances),
-            ):
-                refuse(f"{sensor.sensor}: {name} varies, but {EXPORTED}", varying=bool(np.any(values != values[0])))
+            varying = any(np.any(values != values[0]) for values in (sensor.references_f, sensor.covariances))
+            refuse(f"{sensor.sensor} varies, but {EXPORTED}", varying=varying)
     series = [template(sensor, 0.0) for sensor in sensors]
     record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
     identifiers = [identifier(vectors.sensor) for vectors in record.vectors]
