@@ -112,7 +112,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
         )
 
     def ours() -> tuple[np.ndarray, int]:
-        optimum = tuning.search(objective, objective.start, {})
+        optimum = tuning.search(objective, objective.start)
         return optimum.point, optimum.steps + 1
 
     def gradient(x: np.ndarray) -> tuple[float, np.ndarray]:

@@ -69,7 +69,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
     for name, factor in (("too large", wrong), ("too small", 1.0 / wrong)):
         before[name] = tuning.with_values(right, {key: factor * value for key, value in truth.items()})
         objective = tuning.likelihood([train], before[name], FREE)
-        tuned[name] = tuning.fit(objective, starts=starts, factor=wrong, seed=seed, threads=2)
+        tuned[name] = tuning.fit(objective, starts=starts, seed=seed, threads=2)
     result = Result(
         truth=truth,
         too_large=tuned["too large"],

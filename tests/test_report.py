@@ -23,7 +23,6 @@ from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
 from strapdown.report import comparisons, page
 from strapdown.results import Table
-from strapdown.tuning import fitting
 from strapdown.units import DEGREE_PER_HOUR
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
@@ -313,14 +312,14 @@ def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
     verdicts[0].findings = findings
     after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
     comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
-    tuned = SimpleNamespace(comparison=comparison, composite=False)
-    answer, reason, details = fitting.verdict(tuned)
+    tuned, verdict = SimpleNamespace(comparison=comparison, composite=False), sd.tuning.Tuning.verdict.fget
+    answer, reason, details = verdict(tuned)
     assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
     assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
     comparison.better = True
-    assert fitting.verdict(tuned)[2] == ["odd"]
+    assert verdict(tuned)[2] == ["odd"]
     after.attitude_rms = 1.1
-    assert fitting.verdict(tuned)[2] == [
+    assert verdict(tuned)[2] == [
         "odd", "on the held-out data the attitude error has increased: keep the previous filter"
     ]  # fmt: skip
 

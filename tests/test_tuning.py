@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import pickle
-import time
 import types
 
 import mpmath
@@ -190,7 +189,7 @@ def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many
 @pytest.mark.parametrize("free", [ALL, ("filter.scale",)], ids=["eight", "scale"])
 def test_the_gradient_is_that_of_the_likelihood(free):
     start = tuning.record_case(every_kind(), KINDS, seed=3)
-    objective = tuning.likelihood([start], KINDS, free, parts=5)
+    objective = tuning.likelihood([start], KINDS, free)
     point = objective.start + 0.2
     derivatives = objective.derivatives(point)
     expected = differences(lambda x: objective.minus_log(x)[0], point)
@@ -431,7 +430,9 @@ def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     simulated_case = case()
     off = tuning.with_values(BELIEVED, {"gyro.arw": 3.0 * ARW})
     objective = tuning.likelihood([simulated_case], off, ["gyro.arw", "star 2.sigma", "initial.bias"])
-    fit = tuning.fit(objective, starts=1, progress=lambda words: None)
+    heard = []
+    fit = tuning.fit(objective, starts=1, progress=heard.append)
+    assert heard == ["searches: 0 of 1", "searches: 1 of 1", *(f"intervals: {k} of 3" for k in range(4))]
     assert str(pickle.loads(pickle.dumps(fit))) == str(fit)
     assert fit.setup.process_noise.angle_random_walk == pytest.approx(fit["gyro.arw"].value)
     assert fit.setup.process_noise.rate_random_walk == RRW
@@ -512,22 +513,6 @@ def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
         ]
     assert min(values["plain"]) > 1.4
     np.testing.assert_allclose(values["gate"], 1.0, rtol=0.35)
-
-
-def test_progress_counts_what_has_ended_in_any_order():
-    heard = []
-    stage = fitting._Stage(heard.append)
-
-    def work(job):
-        for _ in range(1000 if job == 0 else 0):  # the first ends last
-            if stage.what == "searches: 1 of 2":
-                break
-            time.sleep(0.001)
-        stage.evaluated()
-        return job
-
-    assert stage.each("searches", work, [0, 1], 2) == [0, 1]
-    assert heard == ["searches: 0 of 2, 1 evaluations", "searches: 1 of 2, 2 evaluations"]
 
 
 def test_against_a_truth_wrong_parameters_come_back():
@@ -682,16 +667,16 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
 def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_likelihood(monkeypatch, mode):
     """Of a profile that is a parabola in σ with its least at ``mode``: the bound is at mode + 1.645, the mean that of a cut normal."""
 
-    def at(objective, point, priors, *, fixed, steps):
+    def at(objective, point, *, fixed, steps):
         sigma = np.exp(point[0])
         return types.SimpleNamespace(
             point=np.array(point), local=types.SimpleNamespace(value=0.5 * (sigma - mode) ** 2)
         )
 
     monkeypatch.setattr(fitting, "search", at)
-    objective = types.SimpleNamespace(names=("star.sigma",), start=np.array([0.0]))
+    objective = types.SimpleNamespace(names=("star.sigma",), start=np.array([0.0]), priors={})
     best = types.SimpleNamespace(point=np.array([np.log(mode)]), local=types.SimpleNamespace(value=0.0))
-    interval = fitting._profiled(objective, best, 0, {}, 1.0, 1.0)
+    interval = fitting._profiled(objective, best, 0, fitting._Errors(None, np.ones(1), np.ones(1), False))
     assert not interval.identified
     assert interval.lower == 0.0
     assert interval.upper == pytest.approx(mode + 1.6448536269514722, rel=0.006)
@@ -710,5 +695,7 @@ def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_like
     ],
 )
 def test_a_parameter_known_within_a_factor_of_four_is_identified(lower, upper, error, note):
-    known = fitting._Known(lower=lower, upper=upper, mean=1.0, identified=True)
-    assert fitting._note("star.sigma", known, error, None, 0, {}, doubtful=False) == note
+    interval = fitting._Interval(lower, upper, 1.0, identified=True)
+    objective = types.SimpleNamespace(names=("star.sigma",), priors={})
+    errors = fitting._Errors(None, np.array([error]), np.ones(1), misfit=False)
+    assert fitting._note(objective, None, 0, interval, errors) == note

@@ -96,7 +96,7 @@ def test_every_lane_is_the_filter_itself_with_every_state_and_kind_of_sensor(sta
     filter_setup = dataclasses.replace(two_stars.KINDS, states=states, sigma=sigma)
     case = tuning.record_case(record, filter_setup, seed=3)
     names = (*others, *parameters.state_names(states))
-    objective = tuning.likelihood([case], filter_setup, names, parts=7)
+    objective = tuning.likelihood([case], filter_setup, names)
     points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (9, len(names)))
     points[8] = objective.start
     if "gyro.scale_sigma" in names:

@@ -16,7 +16,7 @@ from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
-from strapdown.tuning import fitting, innovations, outliers
+from strapdown.tuning import innovations, outliers, result
 
 
 def scenario(duration: float = 200.0, share: float = 0.05) -> scenarios.Scenario:
@@ -245,7 +245,7 @@ def recovered(seeds: int, duration: float) -> tuple[np.ndarray, np.ndarray, np.n
     for seed in range(seeds):
         objective = tuning.contaminated_likelihood([case(seed, duration)], wrong, FREE)
         fit = tuning.fit(objective, starts=1)
-        gates.append(tuning.tuned_gate(objective, fit))
+        gates.append(tuning.tuned_gate(fit))
         errors.append(np.log([parameter.value for parameter in fit.parameters] / truth))
         stated.append([parameter.standard_error for parameter in fit.parameters])
         inside.append(
@@ -275,13 +275,13 @@ def test_five_in_a_hundred_ten_times_as_wide_are_found_from_wrong_parameters():
 
 def test_the_gate_is_described_by_the_share_that_it_refuses():
     """Of 1e-5: the share that it accepts would be printed as 100 %."""
-    share = fitting.Estimated(
+    share = result.Estimated(
         name="outliers.share", unit="", start=0.02, value=0.01, most_likely=0.01, lower=0.008, upper=0.012, standard_error=0.1,
         identified=True, note="",
     )  # fmt: skip
     described = outliers.TunedGate(
         gate=Gate(probability=1.0 - 1e-5), probability=1.0 - 1e-5, lower=1.0 - 4e-5, upper=1.0 - 2e-6, thresholds={"st": 25.0},
-        share=share, scale=share,
+        share=share,
     )  # fmt: skip
     assert described.words.endswith("The gate refuses 0.001 % of valid measurements (95 %: 0.0002 to 0.004).")
 
@@ -319,7 +319,7 @@ def test_where_there_is_none_there_is_no_gate():
     fit = tuning.fit(objective, starts=1)
     assert not fit["outliers.share"].identified
     assert fit["outliers.share"].upper < 0.03
-    gate = tuning.tuned_gate(objective, fit)
+    gate = tuning.tuned_gate(fit)
     assert gate.gate is None
     assert np.isnan(gate.probability)
     # What is tuned beside it is what it is without.
@@ -330,7 +330,7 @@ def test_where_there_is_none_there_is_no_gate():
 
 def test_random_starts_stay_where_outliers_are_outliers():
     objective = tuning.contaminated_likelihood([case(2, 600.0)], tuning.with_values(BELIEVED, WRONG), FREE)
-    fit = tuning.fit(objective, starts=4, intervals=False, factor=30.0)
+    fit = tuning.fit(objective, starts=4, intervals=False)
     assert fit.agreeing == 4
     low, high = np.log(outliers.SHARES)
     assert np.all((fit.starts[:, -2] >= low) & (fit.starts[:, -2] <= high))
@@ -370,7 +370,7 @@ def test_the_gate_makes_the_filter_credible_on_data_held_out():
     wrong = tuning.with_values(BELIEVED, WRONG)
     objective = tuning.contaminated_likelihood([train], wrong, FREE)
     fit = tuning.fit(objective, starts=1)
-    gate = tuning.tuned_gate(objective, fit).gate
+    gate = tuning.tuned_gate(fit).gate
     assert gate is not None
     after = dataclasses.replace(fit.setup, gate=gate)
     compared = tuning.compare(test, wrong, after)
@@ -382,7 +382,7 @@ def test_the_gate_makes_the_filter_credible_on_data_held_out():
     plain = tuning.fit(tuning.likelihood([train], wrong, FREE), starts=1)
     assert plain["star 2.sigma"].value > 1.6 * fit["star 2.sigma"].value
     # The likelihood of what is held out, of the mixture, is more than that of the best single normal.
-    likely = tuning.log_likelihood(test, objective, dataclasses.replace(fit, setup=after))
+    likely = tuning.log_likelihood(test, dataclasses.replace(fit, setup=after))
     assert likely > tuning.compare(test, wrong, plain.setup).after.log_likelihood + 0.05
 
 
@@ -392,9 +392,9 @@ def test_a_gate_of_the_setup_keeps_what_else_it_says_and_so_many_outliers_are_no
     fit = tuning.fit(objective, starts=1, intervals=False)
     known = {"identified": True}  # which intervals would say
     fit = dataclasses.replace(fit, parameters=tuple(dataclasses.replace(p, **known) for p in fit.parameters))
-    gate = tuning.tuned_gate(objective, fit)
+    gate = tuning.tuned_gate(fit)
     assert gate.gate is not None
     assert gate.gate.recovery is None
     assert gate.gate.probability == gate.probability != 0.9
     many = tuple(dataclasses.replace(p, value=0.39) if p.name == "outliers.share" else p for p in fit.parameters)
-    assert tuning.tuned_gate(objective, dataclasses.replace(fit, parameters=many)).gate is None
+    assert tuning.tuned_gate(dataclasses.replace(fit, parameters=many)).gate is None

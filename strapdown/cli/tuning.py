@@ -89,6 +89,6 @@ def tune(
     with ui.progress_bar("slices of the likelihood"):
         slices = sd.tuning.slices(result)
     write_json(beside, {"records": list(sources), **result.summary(), "slices": slices.summary()})
-    answer, reason, details = sd.tuning.fitting.verdict(result)
+    answer, reason, details = result.verdict
     ui.say(f"{answer}: {reason}.", *(f"  - {detail}" for detail in details if result.comparison is not None))
     ui.written(out, beside, *sd.plots.draw_tuning(result, slices, out, form))

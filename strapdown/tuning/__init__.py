@@ -7,6 +7,7 @@
 - ``errors``: Likelihood of the errors against a truth.
 - ``outliers``: Likelihood of innovations with outliers, and the matching gate.
 - ``fitting``: The search from several starts, intervals, identifiability.
+- ``result``: The result of a tuning, with its verdict.
 - ``parameters``: Names, fields in a filter setup and units of the parameters; priors.
 - ``initialization``: Initial state of the filter on a record.
 - ``residual_checks``: Errors that the tuned filter does not model, such as a scale factor absorbed by the gyro's noise.
@@ -24,13 +25,14 @@ tune only ``filter.scale``, which scales the σ and leaves the estimates unchang
 """
 
 from strapdown.tuning.errors import error_objective
-from strapdown.tuning.fitting import Slices, Tuning, fit, search, slices
+from strapdown.tuning.fitting import fit, search
 from strapdown.tuning.initialization import by_innovations, one_gyro, record_case, recording_case
 from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import Case
 from strapdown.tuning.outliers import GATED, TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names, priors_from_gyro, unit_of, values_of, with_values
 from strapdown.tuning.residual_checks import Unmodelled, examined, unmodelled
+from strapdown.tuning.result import Slices, Tuning, slices
 from strapdown.tuning.validation import Comparison, compare, split
 
 __all__ = [

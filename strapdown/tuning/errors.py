@@ -10,7 +10,7 @@ sandwich.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -19,8 +19,8 @@ from strapdown import consistency
 from strapdown.checks import Array, InputError
 from strapdown.consistency.alignment import turns
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import Likelihood, with_engine
-from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, make_problem
+from strapdown.tuning.innovations import Likelihood, likelihood
+from strapdown.tuning.objective import PARTS, STEP, Case, Derivatives, Objective
 
 MAX_EPOCHS = 1000
 """Maximum number of epochs per record."""
@@ -50,16 +50,13 @@ class ErrorObjective(Objective):
         score = (value[:, 1:] - value[:, :1]) / STEP
         change_e, change_p = (error[:, 1:] - error[:, :1]) / STEP, (P[:, 1:] - P[:, :1]) / STEP
         turned = np.einsum("mab,mlbc->mlac", inverse, change_p)
-        information = np.einsum("mja,mab,mkb->jk", change_e, inverse, change_e) + 0.5 * np.einsum(
-            "mjab,mkba->jk", turned, turned
-        )
-        place = np.arange(len(value)) * self.parts // len(value)
-        sums = np.zeros((self.parts, len(point)))
-        np.add.at(sums, place, score)
-        whole = value[:, 0] + np.log(scale).sum(axis=1)
-        return Derivatives(
-            value=np.bincount(place, whole, self.parts).astype(np.float64), score=sums, information=information
-        )
+        information = np.einsum("mja,mab,mkb->jk", change_e, inverse, change_e)
+        information += 0.5 * np.einsum("mjab,mkba->jk", turned, turned)
+        part = np.arange(len(value)) * PARTS // len(value)
+        sums = np.zeros((PARTS, len(point)))
+        np.add.at(sums, part, score)
+        whole = np.bincount(part, value[:, 0] + np.log(scale).sum(axis=1), PARTS)
+        return Derivatives(value=np.asarray(whole, np.float64), score=sums, information=information)
 
     def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
         """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 if the true bias is unknown."""
@@ -72,24 +69,20 @@ class ErrorObjective(Objective):
 
 
 def error_objective(
-    cases: Sequence[Case],
-    filter_setup: FilterSetup,
-    free: Sequence[str],
-    *,
-    threads: int = 1,
+    cases: Sequence[Case], filter_setup: FilterSetup, free: Sequence[str], *, threads: int = 1
 ) -> ErrorObjective:
     """Return the objective that judges the filter by its errors on records with a truth, or with a reference attitude (attitude only).
 
     The likelihood of the errors under the filter's covariance requires small errors.
     """
-    problem = make_problem(cases, filter_setup, free, threads=threads)
-    base = with_engine(problem)
+    base = likelihood(cases, filter_setup, free, threads=threads)
     references = tuple(_spread(base, number) for number in range(len(base.cases)))
     if len({known.bias is None for known in references}) > 1:
         raise InputError(
             "some records have a true bias, others a reference attitude alone; tune on records of one kind"
         )
-    return ErrorObjective(**vars(problem), base=base, references=references)
+    problem = {each.name: getattr(base, each.name) for each in fields(Objective)}
+    return ErrorObjective(**problem, base=base, references=references)
 
 
 class Reference(NamedTuple):

@@ -36,6 +36,7 @@ from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.tuning.objective import (
     OUTLIERS,
+    PARTS,
     REACH,
     STEP,
     Case,
@@ -173,12 +174,7 @@ class Likelihood(Objective):
             slopes = _slopes(case.problem.error_states)
             whole[..., 3:, 6 + slopes.start : 6 + slopes.stop] *= case.warming[epochs, None, None, None]
         bias = (whole[..., 3:, 3:] @ x[..., 4:, None])[..., 0]
-        fast = np.array(
-            [
-                0.0 if filter_setup.states is None else filter_setup.states.gyro_fast_bias_sigma
-                for filter_setup in setups
-            ]
-        )
+        fast = np.array([(filter_setup.states or States()).gyro_fast_bias_sigma for filter_setup in setups])
         at_start = np.where((epochs == 0) & (len(case.case.initial.values) == 0), -1.0, 1.0)
         added = (at_start[:, None] * fast**2)[..., None, None] * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         return x[..., :4], bias, whole @ P @ np.swapaxes(whole, -1, -2) + added
@@ -320,7 +316,6 @@ def likelihood(
     free: Sequence[str],
     *,
     spacing: float = 0.0,
-    parts: int = 20,
     threads: int = 1,
 ) -> Likelihood:
     """Return the likelihood of the free parameters from the innovations of the filter on some records.
@@ -338,8 +333,6 @@ def likelihood(
     spacing : float, default 0
         Minimum time between the measurements of a sensor that are used, s; these have the weight of all. For correlated disturbances: this
         likelihood holds for white innovations only.
-    parts : int, default 20
-        Number of time spans of each record with separate gradients.
     threads : int, default 1
         Number of records, or points, evaluated in parallel.
 
@@ -348,11 +341,7 @@ def likelihood(
     Objective
         For :func:`fit`.
     """
-    return with_engine(make_problem(cases, filter_setup, free, spacing=spacing, parts=parts, threads=threads))
-
-
-def with_engine(problem: Objective) -> Likelihood:
-    """Return the likelihood of a problem."""
+    problem = make_problem(cases, filter_setup, free, spacing=spacing, threads=threads)
     return Likelihood(**vars(problem), prepared=tuple(_prepared(problem, case) for case in problem.cases))
 
 
@@ -369,13 +358,12 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
     steps = setup.at_steps(case.record, problem.filter_setup)
     record = problem.modelled(steps, problem.filter_setup)
     motion = setup.measured_motion(record, problem.filter_setup)
-    prepared = replace(
-        setup.prepared(record, problem.filter_setup, problem.initial(case, problem.filter_setup)), motion=motion
-    )
+    initial = problem.initial(case, problem.filter_setup)
+    prepared = replace(setup.prepared(record, problem.filter_setup, initial), motion=motion)
     model, state = _filter(problem, case, prepared.events, problem.filter_setup)
     start, end = float(record.time[0]), float(record.time[-1])
     first, last = max(case.first, start), min(case.last, end)
-    inner = list(np.linspace(first, last, problem.parts + 1)[1:-1])
+    inner = list(np.linspace(first, last, PARTS + 1)[1:-1])
     before = [np.nextafter(case.first, -np.inf)] if case.first > start else []
     after = [case.last] if case.last < end else []
     slopes = _slopes(prepared.error_states)
@@ -386,7 +374,7 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
         problem=prepared,
         filter=(model, state),
         cuts=np.array([*before, *inner, *after]),
-        used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
+        used=np.array([False] * len(before) + [True] * PARTS + [False] * len(after)),
         lengths=forward.divisors(
             record, prepared.events, prepared.model, forward.unit_sigmas(record, prepared.model, {})
         ),

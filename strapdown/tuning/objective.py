@@ -6,7 +6,7 @@ likelihood of the innovations (:mod:`strapdown.tuning.innovations`), or of the e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -23,6 +23,7 @@ from strapdown.tuning.parameters import (
     INITIAL_BIAS,
     OUTLIER_SCALE,
     OUTLIER_SHARE,
+    Prior,
     Unit,
     by_axis,
     checked_names,
@@ -34,6 +35,8 @@ from strapdown.vectors import VectorMeasurements
 
 STEP = 2.0**-15
 """Step of a log parameter for derivatives; the error of the difference is half of it times the curvature."""
+PARTS = 20
+"""Number of time spans of each record with separate gradients."""
 REACH = 16.0
 """Maximum change of a log parameter from its initial value."""
 OUTLIERS = (OUTLIER_SHARE, OUTLIER_SCALE)
@@ -118,10 +121,7 @@ def joined(parts: Sequence[Derivatives]) -> Derivatives:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Objective:
-    """Objective to minimise: minus a log likelihood, or a substitute; a subclass defines its value on the records.
-
-    Created by :func:`strapdown.tuning.likelihood`, :func:`contaminated_likelihood` and :func:`error_objective` of the same package.
-    """
+    """Objective to minimise: minus a log likelihood, or a substitute; a subclass defines its value on the records."""
 
     names: tuple[str, ...]
     """Names of the free parameters."""
@@ -130,12 +130,10 @@ class Objective:
     start: Array
     """Logarithms of the free parameters in that setup (p,)."""
     cases: tuple[Case, ...] = field(repr=False)
-    parts: int = 20
-    """Number of time spans of each record with separate gradients."""
     threads: int = 1
     spacing: float = 0.0
-    evaluated: Callable[[], object] = field(default=int, repr=False)
-    """Called after each evaluation of a search. Default: no effect, and can be pickled, unlike a lambda."""
+    priors: Mapping[str, Prior] = field(default_factory=dict)
+    """Priors, which a search adds to the objective."""
     composite: ClassVar[bool] = False
     """Whether its curvature is not an information matrix, so standard errors are from the scatter of its gradient."""
 
@@ -204,9 +202,8 @@ class Objective:
         """Return the initial state of the filter of a setup."""
         if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
             return setup.initial_state(filter_setup, case.initial.attitude, case.initial.bias)
-        factor = (
-            filter_setup.measurement_sigma_factor / self.filter_setup.measurement_sigma_factor
-        )  # the common scale of all σ
+        # The common scale of all σ.
+        factor = filter_setup.measurement_sigma_factor / self.filter_setup.measurement_sigma_factor
         return case.initial if factor == 1.0 else replace(case.initial, covariance=factor**2 * case.initial.covariance)
 
 
@@ -216,7 +213,6 @@ def make_problem(
     free: Sequence[str],
     *,
     spacing: float = 0.0,
-    parts: int = 20,
     threads: int = 1,
 ) -> Objective:
     """Return the checked problem of a tuning: records, filter and parameters, without an objective on the records."""
@@ -237,7 +233,6 @@ def make_problem(
         filter_setup=with_values(filter_setup, values),
         start=np.log(list(values.values())),
         cases=tuple(cases),
-        parts=count("parts", parts),
         threads=count("threads", threads),
         spacing=non_negative("spacing", spacing, unit="s"),
     )

@@ -25,10 +25,10 @@ import numpy as np
 from strapdown.checks import Array, InputError, positive
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.fitting import Estimated, Tuning
 from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, SCALES, SHARES, Case
 from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
+from strapdown.tuning.result import Estimated, Tuning
 from strapdown.vectors import KINDS
 
 GATED = ("gate.probability", *OUTLIERS)
@@ -75,7 +75,7 @@ class TunedGate:
     thresholds: dict[str, float]
     """NIS above which an outlier is more likely, by sensor; the filter has one probability for all, the mean over measurements."""
     share: Estimated
-    scale: Estimated
+    """Fraction of the measurements that are outliers."""
 
     @property
     def words(self) -> str:
@@ -91,48 +91,35 @@ class TunedGate:
         )
 
 
-def tuned_gate(objective: Likelihood, tuning: Tuning) -> TunedGate:
+def tuned_gate(tuning: Tuning) -> TunedGate:
     """Return the gate at the Bayes threshold, with its interval from those of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
-    sensors = _noise_by_sensor(objective, tuning.point[:-2])
-    best, thresholds = _probability(sensors, np.array([[share.value, scale.value]]))
-    by_sensor = {name: float(value[0]) for name, value in thresholds.items()}
     if not share.identified or share.value > MAX_REFUSED:
-        return TunedGate(
-            gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
-        )
-    # Standard errors by the sandwich if the tuning used it.
-    swollen = np.array([estimate.standard_error for estimate in (share, scale)]) / np.sqrt(
-        np.diag(tuning.covariance)[-2:]
-    )
-    covariance = tuning.covariance[-2:, -2:] * swollen[:, None] * swollen
-    normal = np.random.default_rng(0).standard_normal((DRAWS, 2)) @ np.linalg.cholesky(covariance).T
-    tried = np.exp(np.log([share.value, scale.value]) + normal)
-    tried = np.column_stack([np.minimum(tried[:, 0], SHARES[1]), np.maximum(tried[:, 1], 1.01)])
-    lower, upper = np.quantile(_probability(sensors, tried)[0], [0.025, 0.975])
+        nan = math.nan
+        return TunedGate(gate=None, probability=nan, lower=nan, upper=nan, thresholds={}, share=share)
+    assert isinstance(tuning.objective, Likelihood)
+    sensors = _noise_by_sensor(tuning.objective, tuning.point[:-2])
+    best, thresholds = _probability(sensors, np.array([[share.value, scale.value]]))
+    normal = np.random.default_rng(0).standard_normal((DRAWS, 2)) @ np.linalg.cholesky(tuning.covariance[-2:, -2:]).T
+    drawn = np.exp(np.log([share.value, scale.value]) + normal)
+    drawn = np.column_stack([np.minimum(drawn[:, 0], SHARES[1]), np.maximum(drawn[:, 1], 1.01)])
+    lower, upper = np.quantile(_probability(sensors, drawn)[0], [0.025, 0.975])
     return TunedGate(
         gate=replace(tuning.setup.gate or Gate(), probability=float(best[0])),
         probability=float(best[0]),
         lower=float(lower),
         upper=float(upper),
-        thresholds=by_sensor,
+        thresholds={name: float(value[0]) for name, value in thresholds.items()},
         share=share,
-        scale=scale,
     )
 
 
-def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> float:
+def log_likelihood(cases: Sequence[Case], tuning: Tuning) -> float:
     """Return the log likelihood of cases, such as held-out ones, under the tuned filter and its outliers, in nats per innovation."""
-    share, scale = result[OUTLIER_SHARE].value, result[OUTLIER_SCALE].value
-    other = contaminated_likelihood(
-        cases,
-        result.setup,
-        tuned.names[:-2],
-        share=float(np.clip(share, *SHARES)),
-        scale=float(np.clip(scale, *SCALES)),
-    )
-    number = sum(sensor.degrees * sensor.number for sensor in _noise_by_sensor(other, other.start[:-2]).values())
-    return float(-other.minus_log(other.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
+    share, scale = np.clip(np.exp(tuning.point[-2:]), *np.transpose([SHARES, SCALES])).tolist()
+    held = contaminated_likelihood(cases, tuning.setup, tuning.objective.names[:-2], share=share, scale=scale)
+    number = sum(sensor.degrees * sensor.number for sensor in _noise_by_sensor(held, held.start[:-2]).values())
+    return float(-held.minus_log(held.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,9 +34,9 @@ from strapdown.tuning.diagnosis import Cause
 from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, gyro_error
 from strapdown.tuning.diagnosis.likelihood import Model, by_mean, log_p, run
 from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
-from strapdown.tuning.fitting import Tuning
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
+from strapdown.tuning.result import Tuning
 from strapdown.tuning.validation import performance
 
 PROBABILITY = 0.99

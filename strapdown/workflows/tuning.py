@@ -71,7 +71,7 @@ def tune(
     threads : int, optional
         Number of threads. Default: one per core.
     progress : callable, optional
-        Called after each evaluation with the progress, such as ``"searches: 1 of 4, 23 evaluations"``.
+        Called with the progress, such as ``"searches: 1 of 4"``.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def tune(
     objective = _objective(train, setup, names, truth=truth, gate=gate, spacing=spacing, threads=threads)
     at_once = 1 if truth and len(train) > 1 else threads  # searches, unless records are evaluated in parallel
     result = tuning.fit(objective, priors=priors, starts=starts, seed=seed, threads=at_once, progress=progress)
-    result = tuning.examined(train, setup, _completed(result, objective, setup, held, threads))
+    result = tuning.examined(train, setup, _completed(result, setup, held, threads))
     return dataclasses.replace(result, remarks=tuple(remarks))
 
 
@@ -188,20 +188,18 @@ def _objective(
     return tuning.likelihood(cases, setup, names, spacing=spacing)
 
 
-def _completed(result: Tuning, objective: Objective, before: FilterSetup, held: Sequence[Case], threads: int) -> Tuning:
+def _completed(result: Tuning, before: FilterSetup, held: Sequence[Case], threads: int) -> Tuning:
     """Return the result of a search with the gate, if outliers are modelled, and the comparison on held-out data, if there are any."""
     from strapdown import tuning
 
-    mixed = objective if isinstance(objective, tuning.Likelihood) and objective.mixed else None
-    if mixed is not None:
-        gated = tuning.tuned_gate(mixed, result)
+    if result.objective.mixed:
+        gated = tuning.tuned_gate(result)
         tuned = result.setup if gated.gate is None else dataclasses.replace(result.setup, gate=gated.gate)
         result = dataclasses.replace(result, gate=gated, setup=tuned)
     if held:
         comparison = tuning.compare(held, before, result.setup, threads=threads)
-        if mixed is not None:  # the likelihood after tuning includes the gate
-            likely = tuning.log_likelihood(held, mixed, result)
-            after = dataclasses.replace(comparison.after, log_likelihood=likely)
+        if result.objective.mixed:  # the likelihood after tuning includes the gate
+            after = dataclasses.replace(comparison.after, log_likelihood=tuning.log_likelihood(held, result))
             comparison = dataclasses.replace(comparison, after=after)
         result = dataclasses.replace(result, comparison=comparison)
     return result
