@@ -17,7 +17,7 @@ from strapdown.recordings import recordfiles
 from strapdown.records import Origin
 from strapdown.report import tunings
 from strapdown.tuning import residual_checks
-from strapdown.tuning.diagnosis import turning
+from strapdown.tuning.diagnosis import hypotheses
 
 SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
 
@@ -93,7 +93,7 @@ def test_measurements_with_a_sigma_for_each_axis_are_not_examined():
 def test_the_turns_are_those_of_the_body_without_its_bias():
     case, result = tuned(4)
     initial = setup.initial_state(result.setup, case.initial.attitude, case.initial.bias)
-    turns = turning.turns(case.record, result.setup.process_noise, initial)
+    turns = hypotheses.turns(case.record, result.setup.process_noise, initial)
     exact = scenario().motion.increments(case.record.time)
     late = slice(2000, -100)
     assert np.std(turns[late] - exact[late], axis=0).max() < 0.15 * np.std(exact, axis=0).max()
@@ -105,7 +105,7 @@ def test_the_turns_leave_out_a_large_bias():
     biased = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
     filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(biased, states=False), bias_sigma=1e-2)
     case = tuning.record_case(scenarios.simulate(biased, 1), filter_setup, seed=1)
-    turns = turning.turns(case.record, filter_setup.process_noise, case.initial)
+    turns = hypotheses.turns(case.record, filter_setup.process_noise, case.initial)
     excess = (turns - biased.motion.increments(case.record.time))[2000:-100] * 10.0
     assert np.abs(excess.mean(axis=0)).max() < 2e-4
 
@@ -135,7 +135,7 @@ def test_noise_explains_nothing(changes, seeds):
         case = tuning.record_case(scenarios.simulate(changed, seed), filter_setup, seed=seed)
         scale_factor = residual_checks.scale_factor(case.record, filter_setup.process_noise, case.initial)
         assert scale_factor.finding.p_value > 0.05
-        assert np.abs(scale_factor.estimate).max() < 5.0 * turning.PLAUSIBLE
+        assert np.abs(scale_factor.estimate).max() < 5.0 * hypotheses.PLAUSIBLE
         assert changes is STILL or np.all(np.abs(scale_factor.estimate) < 3.0 * scale_factor.standard_error)
 
 

@@ -5,9 +5,6 @@ the rate, so the random walk of the bias is tuned large enough to cover that; it
 test is then whether a scale factor explains the innovations better: the hypothesis of :mod:`strapdown.tuning.diagnosis`, with the tuned
 random walk and with smaller ones, which a filter that models the scale factor would have. Its gain is twice the log-likelihood ratio to the
 tuned filter, χ² with three degrees of freedom if the scale factor is zero.
-
-The rate that θ multiplies is the gyro's, without its bias and noise (:func:`strapdown.tuning.diagnosis.turning.turns`), because noise must
-not explain itself. A prior of ``PLAUSIBLE`` bounds θ if the rates are too small to determine it.
 """
 
 from __future__ import annotations
@@ -31,9 +28,8 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.tuning import diagnosis
 from strapdown.tuning.diagnosis import Cause
-from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, gyro_error
+from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, PLAUSIBLE, gyro_error, turns
 from strapdown.tuning.diagnosis.likelihood import Model, by_mean, log_p, run
-from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
 from strapdown.tuning.result import Tuning

@@ -14,7 +14,6 @@ by a more accurate integration algorithm, and compared with the filter's σ of t
 - ``diagnosing``: :func:`diagnose`.
 - ``causes``: The result, :class:`Diagnosis`.
 - ``hypotheses``, ``commutation``: Possible faults.
-- ``turning``: Rotations on which a gyro's scale factor, misalignment and mounting act.
 - ``likelihood``: The likelihood of the record under a hypothesis.
 """
 

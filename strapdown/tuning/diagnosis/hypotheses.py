@@ -5,17 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
 from strapdown import estimation, quaternion
 from strapdown.ahrs.check_conventions import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.checks import Array
+from strapdown.estimation.states import ProcessNoise
+from strapdown.records import ImuRecord
 from strapdown.tuning.diagnosis.causes import Cause
 from strapdown.tuning.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
-from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.vectors import VectorMeasurements
+
+PLAUSIBLE = 0.01
+"""Prior standard deviation of a scale factor, or of a misalignment, rad."""
+UNLIKELY = 0.01
+"""Probability that noise is detected as motion for a body at rest."""
 
 
 def shown(theta: Array, factor: float = 1.0) -> str:
@@ -41,26 +46,31 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
         yield _time_offset("gyro", tuple(series.sensor for series in measured), interval)
     turned = turns(record, model.noise, model.initial)
     yield from (gyro_error(turned, *kind) for kind in GYRO_ERRORS)
-    for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):
-        sigma = np.sqrt(np.diag(model.initial.covariance)[rows])
-        yield Hypothesis(
-            name=f"initial {part}",
-            of="start",
-            unit=unit,
-            steps=1e-3 * sigma,
-            limit=np.pi,
-            apply=lambda m, theta, part=part: replace(m, initial=_moved(m.initial, part, theta)),  # type: ignore[misc]
-            words=lambda theta, _, part=part, unit=unit, sigma=sigma: (  # type: ignore[misc]
-                f"the initial {part} was in error by {shown(theta)} {unit},  {np.max(np.abs(theta / sigma)):.3g} times its σ: "
-                "the initial covariance is too small"
-            ),
-        )
+    sigma = np.sqrt(np.diag(model.initial.covariance))
+    yield _initial("attitude", "rad", sigma[:3])
+    yield _initial("bias", "rad/s", sigma[3:6])
 
 
-def _moved(state: estimation.State, part: str, theta: Array) -> estimation.State:
-    if part == "attitude":
-        return replace(state, attitude=quaternion.normalize(quaternion.multiply(state.attitude, quaternion.exp(theta))))
-    return replace(state, bias=state.bias + theta)
+def _initial(part: str, unit: str, sigma: Array) -> Hypothesis:
+    def apply(model: Model, theta: Array) -> Model:
+        start = model.initial
+        if part == "bias":
+            return replace(model, initial=replace(start, bias=start.bias + theta))
+        attitude = quaternion.normalize(quaternion.multiply(start.attitude, quaternion.exp(theta)))
+        return replace(model, initial=replace(start, attitude=attitude))
+
+    return Hypothesis(
+        name=f"initial {part}",
+        of="start",
+        unit=unit,
+        steps=1e-3 * sigma,
+        limit=np.pi,
+        apply=apply,
+        words=lambda theta, _: (
+            f"the initial {part} was in error by {shown(theta)} {unit},  {np.max(np.abs(theta / sigma)):.3g} times its σ: "
+            "the initial covariance is too small"
+        ),
+    )
 
 
 def _time_offset(of: str, sensors: tuple[str, ...], interval: float) -> Hypothesis:
@@ -201,7 +211,7 @@ def gyro_error(
     def apply(model: Model, theta: Array) -> Model:
         # Increments times (I + M)⁻¹ would also change their noise and bias.
         excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
-        return replace(model, record=replace(model.record, increments=model.record.increments - excess))
+        return model.with_increments(model.record.increments - excess)
 
     return Hypothesis(
         name=name,
@@ -215,43 +225,63 @@ def gyro_error(
     )
 
 
+def turns(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Array:
+    """Return the rotation of the body in each gyro interval (n, 3), rad, as far as it exceeds the gyro's noise.
+
+    The increments themselves are unsuitable: subtracting a fraction of them reduces the gyro's noise too, so the noise would explain
+    itself, more so the longer the record. So the rate, with the filter's bias subtracted, keeps only the components of its cosine transform
+    above the filter's angle random walk: of m values with standard deviation s the largest is below ``s √(2 ln(m/p))`` except with
+    probability p (the universal threshold of Donoho & Johnstone 1994, Biometrika 81).
+    """
+    from scipy.fft import dct, idct
+
+    estimate = estimation.run(record, noise, initial)
+    dt = record.intervals[:, None]
+    free = record.increments / dt - 0.5 * (estimate.bias[1:] + estimate.bias[:-1])
+    # Unlike Fourier's, it does not require equal ends of the record; being orthonormal, it keeps noise white.
+    parts = dct(free, axis=0, norm="ortho")
+    variance = noise.angle_random_walk**2 / float(np.mean(dt))
+    parts[parts**2 < 2.0 * variance * np.log(parts.size / UNLIKELY)] = 0.0
+    return np.asarray(idct(parts, axis=0, norm="ortho") * dt)
+
+
 def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
     """Yield the hypotheses that scale innovations."""
-
-    def factor(theta: Array) -> float:
-        return float(np.exp(theta[0]))
-
     for series in model.record.vectors:
-        if len(series.time) == 0:
-            continue
-        name = series.sensor
-        yield Hypothesis(
-            name="R",
-            of=name,
-            unit="ln of the factor on σ",
-            steps=np.array([0.1]),
-            limit=6.0,
-            apply=lambda m, theta, name=name: m.with_series(name, lambda s: s.noise_scaled(factor(theta))),  # type: ignore[misc]
-            words=lambda theta, _, name=name: f"the noise of {name} is {factor(theta):.3g} times the filter's model",  # type: ignore[misc]
-        )
-    for term, words in (
-        ("angle_random_walk", "angle random walk"),
-        ("rate_random_walk", "rate random walk of the bias"),
-    ):
-        if getattr(model.noise, term) > 0.0:
-            yield Hypothesis(
-                name="Q",
-                of=words,
-                unit="ln of the factor on σ",
-                steps=np.array([0.2]),
-                limit=6.0,
-                apply=lambda m, theta, term=term: replace(  # type: ignore[misc]
-                    m, noise=replace(m.noise, **{term: getattr(m.noise, term) * factor(theta)})
-                ),
-                words=lambda theta, _, words=words: (  # type: ignore[misc]
-                    f"the gyro's {words} is {factor(theta):.3g} times the filter's model"
-                ),
-            )
+        if len(series.time):
+            yield _sensor_noise(series.sensor)
+    if model.noise.angle_random_walk > 0.0:
+        yield _gyro_noise("angle_random_walk", "angle random walk")
+    if model.noise.rate_random_walk > 0.0:
+        yield _gyro_noise("rate_random_walk", "rate random walk of the bias")
+
+
+def _sensor_noise(sensor: str) -> Hypothesis:
+    return Hypothesis(
+        name="R",
+        of=sensor,
+        unit="ln of the factor on σ",
+        steps=np.array([0.1]),
+        limit=6.0,
+        apply=lambda model, theta: model.with_series(sensor, lambda s: s.noise_scaled(math.exp(theta[0]))),
+        words=lambda theta, _: f"the noise of {sensor} is {math.exp(theta[0]):.3g} times the filter's model",
+    )
+
+
+def _gyro_noise(term: str, name: str) -> Hypothesis:
+    def apply(model: Model, theta: Array) -> Model:
+        size = getattr(model.noise, term) * math.exp(theta[0])
+        return replace(model, noise=replace(model.noise, **{term: size}))
+
+    return Hypothesis(
+        name="Q",
+        of=name,
+        unit="ln of the factor on σ",
+        steps=np.array([0.2]),
+        limit=6.0,
+        apply=apply,
+        words=lambda theta, _: f"the gyro's {name} is {math.exp(theta[0]):.3g} times the filter's model",
+    )
 
 
 MAX_OUTLIERS = 0.25
@@ -262,18 +292,20 @@ def outliers(sensor: str, white: Array) -> Cause:
 
     Outliers have at least three times the σ and are at most a quarter of the samples; otherwise they are a larger noise.
     """
+    from scipy.special import expit
+
     square, degrees = np.sum(white**2, axis=1), white.shape[1]
     share, spread = 0.02, 25.0
-    gain = 0.0
+
+    def log_ratio() -> Array:
+        """Logarithm of the ratio of the outliers' density to that of the others."""
+        return np.asarray(0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread))
+
     for _ in range(60):
-        # Logarithm of the ratio of the outliers' density to that of the others.
-        ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
-        log_odds = ratio + math.log(share) - math.log1p(-share)
-        belongs = np.where(log_odds > 0.0, 1.0, np.exp(np.minimum(log_odds, 0.0))) / (1.0 + np.exp(-np.abs(log_odds)))
+        belongs = expit(log_ratio() + math.log(share) - math.log1p(-share))
         share = float(np.clip(belongs.mean(), 1e-4, MAX_OUTLIERS))
         spread = float(max(np.sum(belongs * square) / max(degrees * belongs.sum(), 1e-12), 9.0))
-    ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
-    gain = 2.0 * float(np.sum(np.logaddexp(math.log1p(-share), ratio + math.log(share))))
+    gain = 2.0 * float(np.sum(np.logaddexp(math.log1p(-share), log_ratio() + math.log(share))))
     return Cause(
         name="outliers",
         of=sensor,
@@ -287,28 +319,29 @@ def outliers(sensor: str, white: Array) -> Cause:
 
 
 def conventions(model: Model, base: Run) -> list[Cause]:
-    """Return the gain of each discrete change of axes, units or quaternion convention."""
-    trials: list[tuple[str, str, Model]] = []
-    for matrix in AXES[1:]:
-        turned = replace(model, record=replace(model.record, increments=model.record.increments @ matrix.T))
-        trials.append(("gyro", f"axes should be read as ({axes_words(matrix)})", turned))
-    for factor, unit in ((180.0 / np.pi, "57.3 times more"), (np.pi / 180.0, "57.3 times less")):
-        scaled = replace(model, record=replace(model.record, increments=model.record.increments * factor))
-        trials.append(("gyro", f"rotation {unit} than recorded (rad for deg?)", scaled))
-    for series in model.record.vectors:
-        name = series.sensor
-        if series.attitude is not None:
-            for words, change in ATTITUDE_READINGS.items():
-                other = model.with_series(name, lambda s, c=change: replace(s, attitude=c(cast(Array, s.attitude))))  # type: ignore[misc]
-                trials.append((name, f"its quaternions are {words}", other))
-            continue
-        for matrix in AXES[1:]:
-            other = model.with_series(name, lambda s, M=matrix: replace(s, vector_b=s.vector_b @ M.T))  # type: ignore[misc]
-            trials.append((name, f"axes should be read as ({axes_words(matrix)})", other))
+    """Return the three changes of axes, units or quaternion convention with the largest gain."""
+    turned, record = model.record.increments, model.record
+    axes = {f"axes should be read as ({axes_words(matrix)})": matrix for matrix in AXES[1:]}
+    units = {
+        "rotation 57.3 times more than recorded": 180.0 / np.pi,
+        "rotation 57.3 times less than recorded": np.pi / 180.0,
+    }
+    trials = [("gyro", words, model.with_increments(turned @ matrix.T)) for words, matrix in axes.items()]
+    trials += [
+        ("gyro", f"{words} (rad for deg?)", model.with_increments(turned * factor)) for words, factor in units.items()
+    ]
+    for k, series in enumerate(record.vectors):
+        if series.attitude is None:
+            changed = {words: replace(series, vector_b=series.vector_b @ matrix.T) for words, matrix in axes.items()}
+        else:
+            readings = {f"its quaternions are {words}": read for words, read in ATTITUDE_READINGS.items()}
+            changed = {words: replace(series, attitude=read(series.attitude)) for words, read in readings.items()}
+        for words, other in changed.items():
+            vectors = (*record.vectors[:k], other, *record.vectors[k + 1 :])
+            trials.append((series.sensor, words, replace(model, record=replace(record, vectors=vectors))))
     causes = []
-    penalty = math.log(len(trials))
-    for of, words, changed in trials:
-        gain = run(changed).gain_over(base)
+    for of, words, trial in trials:
+        gain = run(trial).gain_over(base)
         causes.append(
             Cause(
                 name="wrong convention",
@@ -317,9 +350,8 @@ def conventions(model: Model, base: Run) -> list[Cause]:
                 standard_error=np.empty(0),
                 unit="",
                 gain=gain,
-                log_p=min(0.0, log_p(gain, 1) + penalty),
+                log_p=min(0.0, log_p(gain, 1) + math.log(len(trials))),
                 words=f"{of}: {words}",
             )
         )
-    causes.sort(key=lambda cause: -cause.gain)
-    return causes[:3]
+    return sorted(causes, key=lambda cause: -cause.gain)[:3]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,10 @@ class Model:
         """Return the model with one sensor's series changed."""
         vectors = tuple(change(series) if series.sensor == sensor else series for series in self.record.vectors)
         return replace(self, record=replace(self.record, vectors=vectors))
+
+    def with_increments(self, increments: Array) -> Model:
+        """Return the model with other increments of the gyro."""
+        return replace(self, record=replace(self.record, increments=increments))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,11 +60,10 @@ def run(model: Model) -> Run:
         content = series.vector_b if series.attitude is None else series.attitude
         used = (series.time >= model.record.time[0]) & (series.time <= model.record.time[-1])
         used &= np.isfinite(content).all(axis=1)
-        rows = np.full((len(series.time), innovations.innovation.shape[1]), np.nan)
-        logs = rows.copy()
-        rows[used], logs[used] = innovations.whitened, np.log(innovations.variance)
-        white.append(rows.ravel())
-        log_variance.append(logs.ravel())
+        rows = np.full((2, len(series.time), innovations.innovation.shape[1]), np.nan)
+        rows[:, used] = innovations.whitened, np.log(innovations.variance)
+        white.append(rows[0].ravel())
+        log_variance.append(rows[1].ravel())
     return Run(white=np.concatenate(white), log_variance=np.concatenate(log_variance))
 
 
@@ -75,10 +78,24 @@ class Hypothesis:
     """Steps of θ for finite differences (k,)."""
     limit: float
     """Maximum |θ|."""
-    apply: Callable[[Model, Array], Model] = field(repr=False)
-    words: Callable[[Array, Array], str] = field(repr=False)
+    apply: Callable[[Model, Array], Model]
+    words: Callable[[Array, Array], str]
+    """Description for θ and its standard error."""
     plausible: float | None = None
     """Prior standard deviation of θ; None: a third of the limit."""
+
+    def cause(self, theta: Array, spread: Array, gain: float) -> Cause:
+        """Return the hypothesis with its best-fitting θ."""
+        return Cause(
+            name=self.name,
+            of=self.of,
+            estimate=theta,
+            standard_error=spread,
+            unit=self.unit,
+            gain=gain,
+            log_p=log_p(gain, len(theta)),
+            words=self.words(theta, spread),
+        )
 
 
 def log_p(gain: float, degrees: int) -> float:
@@ -125,16 +142,7 @@ def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
         theta, current, gain = there, trial, better
         if rise < 0.5 or gain < 3.0:
             break
-    return Cause(
-        name=hypothesis.name,
-        of=hypothesis.of,
-        estimate=theta,
-        standard_error=spread,
-        unit=hypothesis.unit,
-        gain=gain,
-        log_p=log_p(gain, k),
-        words=hypothesis.words(theta, spread),
-    )
+    return hypothesis.cause(theta, spread, gain)
 
 
 def by_variance(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
@@ -151,24 +159,13 @@ def by_variance(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
     for _ in range(12):
         low, middle, high = gain(x - step), gain(x), gain(x + step)
         slope, curvature = (high - low) / (2.0 * step), (high - 2.0 * middle + low) / step**2
+        move = math.copysign(1.0, slope)
         if curvature < 0.0:
             spread = math.sqrt(-2.0 / curvature)
-            move = -slope / curvature
-        else:
-            move = math.copysign(1.0, slope)
-        move = min(max(move, -1.0), 1.0)
+            move = min(max(-slope / curvature, -1.0), 1.0)
         if abs(move) < 0.3 * (spread if math.isfinite(spread) else 0.1) or abs(x + move) > hypothesis.limit:
             break
         x += move
     x = max(known, key=lambda point: known[point])
-    best = known[x]
-    return Cause(
-        name=f"{hypothesis.name} too {'small' if x > 0.0 else 'large'}",
-        of=hypothesis.of,
-        estimate=np.array([x]),
-        standard_error=np.array([spread]),
-        unit=hypothesis.unit,
-        gain=best,
-        log_p=log_p(best, 1),
-        words=hypothesis.words(np.array([x]), np.array([spread])),
-    )
+    cause = hypothesis.cause(np.array([x]), np.array([spread]), known[x])
+    return replace(cause, name=f"{hypothesis.name} too {'small' if x > 0.0 else 'large'}")
