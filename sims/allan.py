@@ -63,7 +63,7 @@ class Study:
     estimate: Array
     """Estimated coefficients; NaN if not supported."""
     expected: dict[str, float]
-    """Root mean square of the standard errors of the fits, of the terms present."""
+    """Root mean square of the standard errors by the intervals, of the terms present."""
     misfit_probability: Array
 
     def relative_rms(self, term: str) -> float:
@@ -105,14 +105,15 @@ def study(spec: GyroSpec, *, samples: int, runs: int, sample_interval: float = 0
         for run in range(runs)
     ]
     lower, upper = np.concatenate([f.lower for f in fits]), np.concatenate([f.upper for f in fits])
-    covariance = np.concatenate([f.covariance for f in fits])
+    supported = np.concatenate([f.supported for f in fits])
+    error = np.where(supported, 0.5 * (upper - lower) / 1.96, np.nan)
     present = [i for i, term in enumerate(allan.TERMS) if truth[term] > 0.0]
     return Study(
         truth=truth,
         covered=(lower <= wanted) & (wanted <= upper),
-        supported=np.concatenate([f.supported for f in fits]),
+        supported=supported,
         estimate=np.concatenate([f.estimate for f in fits]),
-        expected={allan.TERMS[i]: float(np.sqrt(np.nanmean(covariance[:, i, i]))) for i in present},
+        expected={allan.TERMS[i]: float(np.sqrt(np.nanmean(error[:, i] ** 2))) for i in present},
         misfit_probability=np.concatenate([f.misfit_probability for f in fits]),
     )
 
@@ -137,14 +138,12 @@ def lines(name: str, result: Study) -> list[str]:
 
 def print_fit(fit: allan.NoiseFit, truth: Mapping[str, float]) -> None:
     """Print the intervals beside the truth."""
-    for row in allan.table(fit):
-        term = str(row["term"])
+    for row in fit.listing().records:
         interval = (
             f"{row['lower']:.4g} to {row['upper']:.4g}" if row["supported"] else f"not seen, below {row['upper']:.4g}"
         )
-        print(
-            f"{'xyz'[row['axis']]} {term:20s} {interval:28s} {row['unit']:10s} truth {truth[term] / allan.UNITS['gyro'][term][1]:.4g}"
-        )
+        size = truth[row["term"]] / allan.UNITS["gyro"][row["term"]].factor
+        print(f"{row['axis']} {row['term']:20s} {interval:28s} {row['unit']:10s} truth {size:.4g}")
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def test_each_sensor_is_identified_in_its_units_and_for_other_programs(succeeds,
                 assert row["lower"] < truth[0] * factors[0] * 1.02
                 assert row["upper"] > truth[0] * factors[0] * 0.98
         assert (out / f"{stem}.png").exists()
-        assert noise_fit.name(sensor, "angle_random_walk") in said
+        assert noise_fit.UNITS[sensor]["angle_random_walk"].name in said
     lines = [line for line in (out / "imu.yaml").read_text().splitlines() if line[0] != "#"]
     pairs = (line.partition("#")[0].split(":") for line in lines)
     kalibr = {name: word.strip() if name == "rostopic" else float(word) for name, word in pairs}

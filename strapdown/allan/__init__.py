@@ -18,7 +18,6 @@ from strapdown.allan.noise_fit import (
     NoiseFit,
     curves_by_axis,
     fit_noise,
-    table,
     to_gyro_parameters,
     upper_bounds,
 )

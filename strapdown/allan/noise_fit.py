@@ -18,13 +18,13 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import checks, units
+from strapdown import checks, gyro, units
 from strapdown.allan.deviation import TERMS, AllanDeviation, Source, averaged, confidence, model_deviation
 from strapdown.allan.spectrum import (
     Bins,
@@ -45,41 +45,46 @@ from strapdown.results import Column, Listed, Table, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
 
-_MICRO_G = 1e-6 * units.STANDARD_GRAVITY
-UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+
+class Unit(NamedTuple):
+    """Unit of a term of a sensor."""
+
+    label: str
+    factor: float
+    """Factor to SI."""
+    name: str
+    """Name of the term for this sensor."""
+    suffix: str
+    """Unit in the key of a file."""
+
+
+def _of_gyro(term: str, label: str) -> Unit:
+    suffix, factor = gyro.FORM[term][0]
+    return Unit(label, factor, term, suffix)
+
+
+_G, _HOUR = 1e-6 * units.STANDARD_GRAVITY, 3600.0
+UNITS: Mapping[str, Mapping[str, Unit]] = {
     "gyro": {
-        "quantization": ("arcsec", units.ARCSECOND),
-        "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
-        "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
-        "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
-        "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+        term: _of_gyro(term, label)
+        for term, label in zip(TERMS, ("arcsec", "°/√h", "°/h", "°/h/√h", "°/h/h"), strict=True)
     },
     "accelerometer": {
-        "quantization": ("mm/s", 1e-3),
-        "angle_random_walk": ("µg/√Hz", _MICRO_G),
-        "bias_instability": ("µg", _MICRO_G),
-        "rate_random_walk": ("µg/√h", _MICRO_G / 60.0),
-        "rate_ramp": ("µg/h", _MICRO_G / 3600.0),
+        "quantization": Unit("mm/s", 1e-3, "quantization", "mm_per_s"),
+        "angle_random_walk": Unit("µg/√Hz", _G, "velocity_random_walk", "ug_per_sqrt_hz"),
+        "bias_instability": Unit("µg", _G, "bias_instability", "ug"),
+        "rate_random_walk": Unit("µg/√h", _G / 60.0, "acceleration_random_walk", "ug_per_sqrt_hour"),
+        "rate_ramp": Unit("µg/h", _G / _HOUR, "acceleration_ramp", "ug_per_hour"),
     },
     "magnetometer": {
-        "quantization": ("nT s", 1e-9),
-        "angle_random_walk": ("nT/√Hz", 1e-9),
-        "bias_instability": ("nT", 1e-9),
-        "rate_random_walk": ("nT/√h", 1e-9 / 60.0),
-        "rate_ramp": ("nT/h", 1e-9 / 3600.0),
+        "quantization": Unit("nT s", 1e-9, "quantization", "nt_s"),
+        "angle_random_walk": Unit("nT/√Hz", 1e-9, "white_noise", "nt_per_sqrt_hz"),
+        "bias_instability": Unit("nT", 1e-9, "bias_instability", "nt"),
+        "rate_random_walk": Unit("nT/√h", 1e-9 / 60.0, "random_walk", "nt_per_sqrt_hour"),
+        "rate_ramp": Unit("nT/h", 1e-9 / _HOUR, "ramp", "nt_per_hour"),
     },
 }
-"""Unit for input and output and its factor to SI, for each term of each sensor."""
-NAMES: Mapping[str, Mapping[str, str]] = {
-    "gyro": {},
-    "accelerometer": {
-        "angle_random_walk": "velocity_random_walk",
-        "rate_random_walk": "acceleration_random_walk",
-        "rate_ramp": "acceleration_ramp",
-    },
-    "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
-}
-"""Name of a term by sensor, if it differs from that of a gyro."""
+"""Unit of each term of each sensor in text and in files."""
 
 TERM_COST = 1.5
 """Penalty on the log-likelihood of a combination of terms per coefficient (Akaike's: 1).
@@ -117,8 +122,6 @@ class NoiseFit(Listed):
         a one-sided bound would have a lower coverage, since the threshold of support selects the low estimates.
     supported : ndarray of bool (axes, terms)
         Whether the record supports the term.
-    covariance : ndarray (axes, terms, terms)
-        Covariance of the estimates, from the Fisher information of all terms at the maximum of the likelihood; NaN for unsupported terms.
     misfit_probability : ndarray (axes,)
         p-value of the record under the fitted noise terms, by the most significant of three tests: its spectrum, its largest sample and its
         noise by segments, the last two after whitening. Near zero the record contains other errors (motion, a vibration line, a low-pass
@@ -140,7 +143,6 @@ class NoiseFit(Listed):
     lower: Array
     upper: Array
     supported: NDArray[np.bool_]
-    covariance: Array
     misfit_probability: Array
     misfit: tuple[str, ...]
     confidence_level: float
@@ -165,17 +167,12 @@ class NoiseFit(Listed):
     def listing(self) -> Table:
         """Return the coefficients with their intervals, as a table."""
         rows = []
-        for row in table(self):
-            term, supported = str(row["term"]).replace("_", " "), row["supported"]
-            values = (
-                row["estimate"] if supported else None,
-                row["lower"] if supported else None,
-                row["upper"],
-                supported,
-            )
-            rows.append(
-                ("xyz"[row["axis"]], f"{row['term']} ({row['symbol']})", term, row["symbol"], row["unit"], *values)
-            )
+        for axis, i in np.ndindex(*self.estimate.shape):
+            unit, symbol = UNITS[self.sensor][self.terms[i]], SYMBOLS[self.terms[i]]
+            supported = bool(self.supported[axis, i])
+            ends = [float(values[axis, i] / unit.factor) for values in (self.estimate, self.lower, self.upper)]
+            shown = ends if supported else [None, None, ends[2]]
+            rows.append(("xyz"[axis], f"{unit.name} ({symbol})", unit.name, symbol, unit.label, *shown, supported))
         columns = (
             Column("axis", "axis"),
             Column("term"),
@@ -200,7 +197,7 @@ class NoiseFit(Listed):
             ``coefficients`` in the units of :data:`UNITS`, ``sample_interval_s``, ``confidence_level``, ``misfit_probability``, ``misfit``.
         """
         own = {name: getattr(self, name) for name in ("confidence_level", "misfit_probability", "misfit")}
-        return plain({"sample_interval_s": self.sample_interval, "coefficients": table(self), **own})  # type: ignore[no-any-return]
+        return plain({"sample_interval_s": self.sample_interval, "coefficients": self.listing().records, **own})  # type: ignore[no-any-return]
 
 
 def fit_noise(
@@ -289,9 +286,20 @@ def fit_noise(
             )
         fits.append(fit_axis(whole, "rate_ramp" in in_order))
         misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
-    samples = sum(segment.place.stop - segment.place.start for segment in segments)
-    fit = _of_axes(in_order, fits, misfits, confidence_level=confidence_level, samples=samples, sample_interval=dt)
-    return replace(fit, sensor=sensor)
+    estimate, lower, upper = _of_axes(fits, in_order, confidence_level)
+    return NoiseFit(
+        terms=in_order,
+        estimate=estimate,
+        lower=lower,
+        upper=upper,
+        supported=~np.isnan(estimate),
+        misfit_probability=np.array([probability for probability, _ in misfits]),
+        misfit=tuple(what for _, what in misfits),
+        confidence_level=confidence_level,
+        samples=sum(segment.place.stop - segment.place.start for segment in segments),
+        sample_interval=dt,
+        sensor=sensor,
+    )
 
 
 def _segments(
@@ -356,23 +364,6 @@ def _by_name(fit: NoiseFit, values: Array, wanted: NDArray[np.bool_]) -> dict[st
     }
 
 
-def name(sensor: str, term: str) -> str:
-    """Return the name of a term for a sensor."""
-    return NAMES[checks.one_of("sensor", sensor, UNITS)].get(term, term)
-
-
-def table(fit: NoiseFit) -> list[dict[str, Any]]:
-    """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: none)."""
-    rows = []
-    for axis, i in np.ndindex(*fit.estimate.shape):
-        term = fit.terms[i]
-        unit, factor = UNITS[fit.sensor][term]
-        ends = {end: float(getattr(fit, end)[axis, i] / factor) for end in ("estimate", "lower", "upper")}
-        known = {"unit": unit, "supported": bool(fit.supported[axis, i])}
-        rows.append({"axis": axis, "term": name(fit.sensor, term), "symbol": SYMBOLS[term], **ends, **known})
-    return rows
-
-
 # Likelihood
 
 
@@ -429,18 +420,6 @@ def _first_guess(bins: Bins) -> Array:
     power = np.add.reduceat(bins.square, edges) / np.add.reduceat(bins.number, edges)
     basis = np.add.reduceat(bins.basis * bins.number, edges, axis=1) / np.add.reduceat(bins.number, edges)
     return np.asarray(np.min(np.maximum(power, 1e-9 * power.max()) / basis, axis=1) / len(basis))
-
-
-def _information(bins: Bins, variance: Array) -> Array:
-    """Return the Fisher information of theta."""
-    weighted = bins.basis * np.sqrt(0.5 * bins.number) / variance
-    return np.asarray(weighted @ weighted.T)
-
-
-def _inverse(information: Array) -> Array:
-    """Return the inverse of an information matrix, scaled to unit diagonal first, so that the units of the terms do not matter."""
-    scale = 1.0 / np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.pinv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
 def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
@@ -510,61 +489,17 @@ def _signed_root(fit: AxisFit, subset: NDArray[np.bool_], i: int, value: float) 
     return math.copysign(math.sqrt(2.0 * max(0.0, fall)), value - best.theta[i])
 
 
-def _covariance(fit: AxisFit, estimate: Array) -> Array:
-    """Return the covariance of the coefficients of one axis from the Fisher information; NaN without an estimate."""
-    supported = ~np.isnan(estimate)
-    size = np.where(supported, estimate, np.sqrt(fit.best.theta))
-    used = np.flatnonzero(size > 0.0)
-    inverse = _inverse(_information(fit.bins, fit.best.variance)[np.ix_(used, used)])
-    covariance = np.full((len(estimate), len(estimate)), np.nan)
-    covariance[np.ix_(used, used)] = inverse * np.outer(0.5 / size[used], 0.5 / size[used])  # d√θ/dθ
-    covariance[~supported, :] = np.nan
-    covariance[:, ~supported] = np.nan
-    return covariance
-
-
-def _of_axes(
-    terms: tuple[str, ...],
-    fits: Sequence[AxisFit],
-    misfits: Sequence[tuple[float, str]],
-    *,
-    confidence_level: float,
-    samples: int,
-    sample_interval: float,
-) -> NoiseFit:
-    """Combine the fits of single axes, with intervals; a misfit is its probability and its description."""
-    count = len(fits[0].best.theta)
-    estimate, lower, upper = np.empty((3, len(fits), len(terms)))
-    covariance = np.full((len(fits), len(terms), len(terms)), np.nan)
-    for i in range(count):
-        weights = _weights(fits, i)
+def _of_axes(fits: Sequence[AxisFit], terms: tuple[str, ...], confidence_level: float) -> Array:
+    """Return estimate, lower and upper end of each coefficient (3, axes, terms); if not supported NaN, 0 and the upper end."""
+    ends = np.empty((3, len(fits), len(terms)))
+    for i, term in enumerate(terms):
+        weights = {} if term == "rate_ramp" else _weights(fits, i)
         for axis, fit in enumerate(fits):
-            estimate[axis, i], lower[axis, i], upper[axis, i] = _interval(fit, i, weights, confidence_level)
-    for axis, fit in enumerate(fits):
-        covariance[axis, :count, :count] = _covariance(fit, estimate[axis, :count])
-        if len(terms) > count:
-            estimate[axis, -1], lower[axis, -1], upper[axis, -1] = _fit_ramp(fit, confidence_level)
-            if not math.isnan(estimate[axis, -1]):
-                covariance[axis, -1, :-1] = covariance[axis, :-1, -1] = np.where(
-                    np.isnan(estimate[axis, :-1]), np.nan, 0.0
-                )
-                covariance[axis, -1, -1] = 1.0 / np.sum(fit.bins.ramp / fit.best.variance)
-    return NoiseFit(
-        terms=terms,
-        estimate=estimate,
-        lower=lower,
-        upper=upper,
-        supported=~np.isnan(estimate),
-        covariance=covariance,
-        misfit_probability=np.array([probability for probability, _ in misfits]),
-        misfit=tuple(what for _, what in misfits),
-        confidence_level=confidence_level,
-        samples=samples,
-        sample_interval=sample_interval,
-    )
+            ends[:, axis, i] = _interval(fit, i, weights, confidence_level) if weights else _ramp(fit, confidence_level)
+    return ends
 
 
-def _fit_ramp(fit: AxisFit, confidence_level: float) -> tuple[float, float, float]:
+def _ramp(fit: AxisFit, confidence_level: float) -> tuple[float, float, float]:
     """Return estimate, lower and upper end of the ramp; if not supported NaN, 0 and a bound on its magnitude."""
     from scipy.optimize import brentq
     from scipy.stats import chi2

@@ -25,26 +25,33 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import checks, gyro
+from strapdown import checks
 from strapdown.allan import noise_fit
-from strapdown.allan.noise_fit import UNITS, NoiseFit, name
+from strapdown.allan.noise_fit import UNITS, NoiseFit
 from strapdown.checks import InputError
 
 __all__ = ["to_kalibr", "to_matlab", "to_px4", "to_specification", "to_toml"]
 
-_KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
-_KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}
 PX4_STEP = 0.01
 """Default of EKF2_PREDICT_US in PX4, s."""
+MATLAB = {
+    "gyro": ("Gyroscope", "gyroparams", 1.0),
+    "accelerometer": ("Accelerometer", "accelparams", 1.0),
+    "magnetometer": ("Magnetometer", "magparams", 1e6),
+}
+"""Property, function and factor to its unit of each sensor in MATLAB."""
 
 
-def key(sensor: str, term: str) -> tuple[str, float]:
-    """Return the TOML key of a term, with its unit in the name, and the factor of the unit to SI."""
-    if sensor == "gyro":
-        suffix, factor = gyro.FORM[term][0]
-        return f"{term}_{suffix}", factor
-    unit, factor = UNITS[checks.one_of("sensor", sensor, UNITS)][term]
-    return f"{name(sensor, term)}_{_KEYS[unit]}", factor
+TURN_ON = [
+    "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
+    "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
+]
+
+
+def key(sensor: str, term: str) -> str:
+    """Return the TOML key of a term, with its unit in the name."""
+    unit = UNITS[sensor][term]
+    return f"{unit.name}_{unit.suffix}"
 
 
 def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
@@ -60,15 +67,11 @@ def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
     dict
         Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
     """
-    sensor = fit.sensor
-    rounded: dict[str, Any] = {}
+    table = {}
     for term, value in noise_fit.to_gyro_parameters(fit).items():
-        factor = key(sensor, term)[1]
-        rounded[term] = np.array([float(f"{x / factor:.6g}") for x in np.atleast_1d(value)]).reshape(np.shape(value))
-    if sensor == "gyro":
-        spec = gyro.GyroSpec(**{term: value * key(sensor, term)[1] for term, value in rounded.items()})
-        return {sensor: gyro.to_table(spec)}
-    return {sensor: {key(sensor, term)[0]: value.tolist() for term, value in rounded.items()}}
+        shown = [float(f"{x / UNITS[fit.sensor][term].factor:.6g}") for x in np.atleast_1d(value)]
+        table[key(fit.sensor, term)] = shown if np.ndim(value) else shown[0]
+    return {fit.sensor: table}
 
 
 def to_specification(fit: NoiseFit, source: str) -> str:
@@ -94,32 +97,22 @@ def to_specification(fit: NoiseFit, source: str) -> str:
     text = commented(lines) + "\n" + tomli_w.dumps(to_toml(fit))
     partly, wholly = [], []
     for term, bound in noise_fit.upper_bounds(fit).items():
-        name_of, factor = key(sensor, term)
-        values = [bound] if isinstance(bound, float) else list(bound)
+        values = [f"{value / UNITS[sensor][term].factor:.4g}" for value in np.atleast_1d(bound)]
         supported = fit.supported[:, fit.terms.index(term)]
         if supported.any():
-            below = ", ".join(
-                f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not supported[k]
+            below = (
+                f"{axis} below {value}" for axis, value, own in zip("xyz", values, supported, strict=False) if not own
             )
-            partly.append(f"{name_of}: 0 where not detected, {below}.")
+            partly.append(f"{key(sensor, term)}: 0 where not detected, {', '.join(below)}.")
         else:
-            shown = ", ".join(f"{value / factor:.4g}" for value in values)
-            wholly.append(f"{name_of} = {shown if len(values) == 1 else f'[{shown}]'}")
+            joined = ", ".join(values)
+            wholly.append(f"{key(sensor, term)} = {joined if len(values) == 1 else f'[{joined}]'}")
     if partly or wholly:
-        text += "\n" + commented(
-            [
-                f"Not detected in the record, so left out; the upper ends of their {100 * fit.confidence_level:g} % intervals:",
-                *partly,
-                *wholly,
-            ]
-        )
+        level = f"{100 * fit.confidence_level:g} %"
+        said = f"Not detected in the record, so left out; the upper ends of their {level} intervals:"
+        text += "\n" + commented([said, *partly, *wholly])
     if sensor == "gyro":
-        text += "\n" + commented(
-            [
-                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
-                "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
-            ]
-        )
+        text += "\n" + commented(TURN_ON)
     return text
 
 
@@ -188,22 +181,20 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
     _both(fits, "Kalibr")
     checks.positive("factor", factor)
     words = "as identified" if factor == 1.0 else f"multiplied by {factor:g}"
-    lines = [
-        f"# {_plain(source)}" if source else "",
-        f"# Noise by `strapdown allan`, the largest of the axes, {words}.",
-    ]
-    for sensor, own, unit in (("accelerometer", "accelerometer", "m/s^2"), ("gyro", "gyroscope", "rad/s")):
-        for term, word, per in (
-            ("angle_random_walk", "noise_density", "1/sqrt(Hz)"),
-            ("rate_random_walk", "random_walk", "1/s/sqrt(Hz)"),
-        ):
-            value, supported = largest(fits[sensor], term)
-            low, high = (factor * end for end in largest_interval(fits[sensor], term))
-            interval = f"{100.0 * fits[sensor].confidence_level:g} % interval {low:.6e} to {high:.6e}"
-            note = "" if supported else "; not detected, the upper end of its interval"
-            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
+    lines = _heading("#", source, f"the largest of the axes, {words}.")
+    for name, sensor, term, unit in (
+        ("accelerometer_noise_density", "accelerometer", "angle_random_walk", "m/s^2 1/sqrt(Hz)"),
+        ("accelerometer_random_walk", "accelerometer", "rate_random_walk", "m/s^2 1/s/sqrt(Hz)"),
+        ("gyroscope_noise_density", "gyro", "angle_random_walk", "rad/s 1/sqrt(Hz)"),
+        ("gyroscope_random_walk", "gyro", "rate_random_walk", "rad/s 1/s/sqrt(Hz)"),
+    ):
+        value, supported = largest(fits[sensor], term)
+        low, high = (factor * end for end in largest_interval(fits[sensor], term))
+        interval = f"{100.0 * fits[sensor].confidence_level:g} % interval {low:.6e} to {high:.6e}"
+        note = "" if supported else "; not detected, the upper end of its interval"
+        lines.append(f"{name}: {factor * value:.6e}  # {unit}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
-    return "\n".join(line for line in lines if line) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def to_px4(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
@@ -229,8 +220,7 @@ def to_px4(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     _both(fits, "PX4")
     root = math.sqrt(PX4_STEP)
     lines = [
-        *([f"# {_plain(source)}"] if source else []),
-        f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * PX4_STEP:.0f} us (EKF2_PREDICT_US).",
+        *_heading("#", source, f"the largest of the axes, over steps of {1e6 * PX4_STEP:.0f} us (EKF2_PREDICT_US)."),
         "# The defaults of PX4 are larger: they include vibration.",
         "# Vehicle-Id Component-Id Name Value Type",
     ]
@@ -261,34 +251,32 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     str
         MATLAB code.
     """
-    objects = {"gyro": ("Gyroscope", "gyroparams", 1.0), "accelerometer": ("Accelerometer", "accelparams", 1.0)}
-    objects["magnetometer"] = ("Magnetometer", "magparams", 1e6)
     rate = 1.0 / next(iter(fits.values())).sample_interval
-    kinds = "-".join(
-        word
-        for sensor, word in (("accelerometer", "accel"), ("gyro", "gyro"), ("magnetometer", "mag"))
-        if sensor in fits
-    )
-    known = {"accel-gyro", "accel-mag", "accel-gyro-mag"}
-    lines = [
-        *([f"% {_plain(source)}"] if source else []),
-        "% Noise by `strapdown allan`, SI; terms not detected on an axis are 0.",
-    ]
-    lines.append(f"imu = imuSensor('{kinds if kinds in known else 'accel-gyro-mag'}', 'SampleRate', {rate:.6g});")
+    parts = {"accelerometer": "accel", "gyro": "gyro", "magnetometer": "mag"}
+    kinds = "-".join(part for sensor, part in parts.items() if sensor in fits)
+    if kinds not in ("accel-gyro", "accel-mag"):
+        kinds = "accel-gyro-mag"
+    lines = _heading("%", source, "SI; terms not detected on an axis are 0.")
+    lines.append(f"imu = imuSensor('{kinds}', 'SampleRate', {rate:.6g});")
     for sensor, fit in fits.items():
-        own, make, factor = objects[sensor]
+        name, make, factor = MATLAB[sensor]
         values = np.where(fit.supported, fit.estimate, 0.0) * factor
-        parts = ["'NoiseType', 'single-sided'"]
+        arguments = ["'NoiseType', 'single-sided'"]
         for term, word in (
             ("angle_random_walk", "NoiseDensity"),
             ("bias_instability", "BiasInstability"),
             ("rate_random_walk", "RandomWalk"),
         ):
             column = np.resize(values[:, fit.terms.index(term)], 3)
-            parts.append(f"'{word}', [{' '.join(f'{x:.6e}' for x in column)}]")
-        joined = ", ...\n    ".join(parts)
-        lines.append(f"imu.{own} = {make}({joined});")
+            arguments.append(f"'{word}', [{' '.join(f'{x:.6e}' for x in column)}]")
+        joined = ", ...\n    ".join(arguments)
+        lines.append(f"imu.{name} = {make}({joined});")
     return "\n".join(lines) + "\n"
+
+
+def _heading(mark: str, source: str, words: str) -> list[str]:
+    """Return the comments at the top of a file."""
+    return [*([f"{mark} {_plain(source)}"] if source else []), f"{mark} Noise by `strapdown allan`, {words}"]
 
 
 def _both(fits: Mapping[str, NoiseFit], what: str) -> None:

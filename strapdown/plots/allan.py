@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown.allan import AllanDeviation, NoiseFit, curves_by_axis
-from strapdown.allan.noise_fit import UNITS, name
+from strapdown.allan.noise_fit import UNITS
 from strapdown.checks import Array
 from strapdown.plots import style
 
@@ -19,7 +19,7 @@ def allan_axis(
 ) -> Axes:
     """Draw one axis of an Allan deviation with its confidence band, the fit, and the fitted terms (``curves``, SI at the same τ)."""
     ax = style.axes_or_new(ax)
-    unit, scale = UNITS[fit.sensor]["bias_instability"]
+    unit, scale, *_ = UNITS[fit.sensor]["bias_instability"]
     upper = np.where(np.isfinite(deviation.upper[axis]), deviation.upper[axis], np.nan)
     band = (deviation.lower[axis] / scale, upper / scale)
     ax.fill_between(
@@ -45,7 +45,7 @@ def allan_axis(
                 "--",
                 color=colors[term],
                 linewidth=1.1,
-                label=name(fit.sensor, term).replace("_", " "),
+                label=UNITS[fit.sensor][term].name.replace("_", " "),
             )
     low, high = np.nanmin(deviation.deviation[axis]) / scale, np.nanmax(deviation.deviation[axis]) / scale
     ax.set_ylim(0.2 * low, 3.0 * high)
@@ -69,7 +69,7 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
     Figure
         One panel for each axis of the sensor.
     """
-    unit, scale = UNITS[fit.sensor]["bias_instability"]
+    unit, scale, *_ = UNITS[fit.sensor]["bias_instability"]
     number = len(deviation.deviation)
     figure, axes = style.new_figure(1, number, size=(1.2 + 3.0 * number, 4.2), sharey=True, squeeze=False)
     for axis, curves in enumerate(curves_by_axis(fit, deviation)):
