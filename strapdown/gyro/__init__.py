@@ -12,9 +12,7 @@ from strapdown.gyro import datasheets as datasheets
 from strapdown.gyro.model import FORM as FORM
 from strapdown.gyro.model import Axes as Axes
 from strapdown.gyro.model import GyroSpec as GyroSpec
-from strapdown.gyro.model import best_bandwidth as best_bandwidth
 from strapdown.gyro.model import bridge_dropped as bridge_dropped
-from strapdown.gyro.model import dropped as dropped
 from strapdown.gyro.model import from_table as from_table
 from strapdown.gyro.model import matched_process_noise as matched_process_noise
 from strapdown.gyro.model import process_noise as process_noise

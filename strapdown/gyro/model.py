@@ -8,19 +8,15 @@ Power spectral densities are two-sided, as in IEEE Std 952: ARW σ_v², flicker 
 
 Flicker in the filter
 ---------------------
-A filter with a random-walk bias does not model flicker. :func:`process_noise` bounds the flicker by the smallest white and random-walk
-noise whose spectrum is nowhere below that of the gyro: ``σ_v'² = σ_v² + B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the
-means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at ω*. The attitude covariance is then never too small.
-:func:`best_bandwidth` gives the ω* of minimum attitude variance, the natural frequency of the filter.
+A filter with a random-walk bias does not model flicker. :func:`matched_process_noise` gives the white and random-walk noise with which its
+attitude variance is the actual one; :func:`process_noise` a bound, a spectrum that is nowhere below that of the gyro: ``σ_v'² = σ_v² +
+B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at
+ω*. The exact model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise per axis.
 
-The bound is conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance equals the actual one. The exact
-model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise per axis.
-
-``sims/flicker_in_filter.py`` compares them on the presets: mean NEES per degree of freedom of the attitude 1.00 to 1.05 matched, 0.92 to
-1.02 with the spectral bound, 1.00 to 1.61 if flicker is ignored. Use the matched noise, or the bound if too small a covariance must be
-excluded. The RMS error is within 1.2 % of that of the augmented filter. For the bias this does not hold: a random-walk bias tracks the
-low-frequency part of the flicker, and its covariance does not include the high-frequency part, which the simulated bias contains. Judge
-such a filter by its attitude.
+``sims/flicker_in_filter.py`` compares them on the presets: mean NEES per degree of freedom of the attitude 1.00 to 1.05 matched, 1.00 to
+1.61 if flicker is ignored; the RMS error is within 1.2 % of that of the augmented filter. For the bias this does not hold: a random-walk
+bias tracks the low-frequency part of the flicker, and its covariance does not include the high-frequency part, which the simulated bias
+contains. Judge such a filter by its attitude.
 """
 
 from __future__ import annotations
@@ -147,30 +143,32 @@ class GyroSpec(ByValue):
 
     def __post_init__(self) -> None:
         """Check every field."""
-        for name, unit in _BY_AXIS.items():
-            object.__setattr__(self, name, _by_axis(name, getattr(self, name), unit))
+        fields: dict[str, Any] = {name: _by_axis(name, getattr(self, name), unit) for name, unit in _BY_AXIS.items()}
         ramp: Any = self.rate_ramp
-        ramp = array("rate_ramp", ramp, (3,)) if np.ndim(ramp) else finite("rate_ramp", ramp, unit="rad/s²")
-        object.__setattr__(self, "rate_ramp", ramp)
+        fields["rate_ramp"] = (
+            array("rate_ramp", ramp, (3,)) if np.ndim(ramp) else finite("rate_ramp", ramp, unit="rad/s²")
+        )
         for name in ("turn_on_bias", "scale_factor", "asymmetry"):
             value = getattr(self, name)
             if not isinstance(value, (bool, str)) and np.ndim(value) == 0:
                 value = np.full(3, finite(name, value))
-            object.__setattr__(self, name, array(name, value, (3,)))
+            fields[name] = array(name, value, (3,))
         for name in ("misalignment", "g_sensitivity"):
-            object.__setattr__(self, name, array(name, getattr(self, name), (3, 3)))
-        if np.any(np.diag(self.misalignment) != 0.0):
+            fields[name] = array(name, getattr(self, name), (3, 3))
+        if np.any(np.diag(fields["misalignment"]) != 0.0):
             raise InputError("misalignment has entries on its diagonal; give those as scale_factor")
         for name, unit in (("markov_correlation_time", "s"), ("bandwidth", "Hz"), ("range", "rad/s")):
             value = float(getattr(self, name))
-            object.__setattr__(self, name, value if value == np.inf else positive(name, value, unit=unit))
-        object.__setattr__(self, "damping", positive("damping", self.damping))
+            fields[name] = value if value == np.inf else positive(name, value, unit=unit)
+        fields["damping"] = positive("damping", self.damping)
         for name in ("sampling_jitter", "timestamp_error"):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name), unit="s"))
-        object.__setattr__(self, "timestamp_offset", finite("timestamp_offset", self.timestamp_offset, unit="s"))
-        object.__setattr__(self, "drop_probability", non_negative("drop_probability", self.drop_probability))
+            fields[name] = non_negative(name, getattr(self, name), unit="s")
+        fields["timestamp_offset"] = finite("timestamp_offset", self.timestamp_offset, unit="s")
+        fields["drop_probability"] = non_negative("drop_probability", self.drop_probability)
         if self.drop_probability >= 1.0:
             raise InputError(f"drop_probability is {self.drop_probability:g}; it must be below 1")
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
 
     @property
     def error_matrix(self) -> Array:
@@ -267,8 +265,9 @@ def simulate(
     low_passed = bool(np.isfinite(spec.bandwidth))
     if np.any(np.asarray(spec.bias_instability) > 0.0) or low_passed:
         _need_uniform(stamps)
-    streams = _streams(key)
-    initial = np.empty((3, 64))
+    streams, initial = np.empty((3, _STREAMS, 2, 4), np.uint64), np.empty((3, 64))
+    for axis, term in np.ndindex(3, _STREAMS):
+        compiled(noise.seed_stream)(key[0], key[1], np.uint64(_STREAMS * axis + term), streams[axis, term])
     for axis in range(3):
         compiled(noise.fill_normals)(streams[axis, _INITIAL], np.empty((2, 32), np.uint64), initial[axis])
     increments, bias = np.empty((n, 3)), np.empty((n + 1, 3))
@@ -350,15 +349,6 @@ def _axes(value: Axes) -> Array:
     return read_only(np.broadcast_to(np.asarray(value, dtype=np.float64), 3))
 
 
-def _streams(key: np.ndarray) -> np.ndarray:
-    streams = np.empty((3, _STREAMS, 2, 4), np.uint64)
-    seed = compiled(noise.seed_stream)
-    for axis in range(3):
-        for term in range(_STREAMS):
-            seed(key[0], key[1], np.uint64(_STREAMS * axis + term), streams[axis, term])
-    return streams
-
-
 def _need_uniform(edges: Array) -> None:
     dt = np.diff(edges)
     mean = (edges[-1] - edges[0]) / len(dt)
@@ -431,11 +421,6 @@ def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -
     return (true if spec.sampling_jitter > 0.0 else nominal), stamps
 
 
-def dropped(spec: GyroSpec, samples: int, generator: np.random.Generator) -> np.ndarray:
-    """Return a mask (samples,) of the lost samples."""
-    return generator.random(samples) < spec.drop_probability
-
-
 def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) -> tuple[Array, np.ndarray]:
     """Return increments without the lost samples, and the indices of the remaining edges.
 
@@ -459,8 +444,7 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
     spec : GyroSpec
         Specification of the gyro.
     bandwidth : float, optional
-        ω*, rad/s, at which the spectral bound equals the flicker: :func:`best_bandwidth` for the measurements. Required if the gyro has
-        flicker.
+        ω*, rad/s, at which the spectral bound equals the flicker, required if the gyro has flicker: the natural frequency of the filter.
 
     Returns
     -------
@@ -487,22 +471,6 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
         white += instability**2 / (2.0 * corner)
         walk += 0.5 * corner * instability**2
     return {"angle_random_walk": float(np.sqrt(white)), "rate_random_walk": float(np.sqrt(walk))}
-
-
-def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
-    """Return the ω*, rad/s, for which the spectral bound of flicker gives the minimum attitude variance.
-
-    A filter with white and random-walk noise and measurements of density r (variance about an axis times the interval, rad² s) has the
-    steady-state variance ``√r √(σ_v'² + 2 σ_u' √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound
-    inserted, its minimum is at ``r ω*⁴ = σ_u² + ω* B²/2``; ω* is the natural frequency of the filter.
-    """
-    _, walk, instability = _filter_terms(spec)
-    density = positive("measurement_density", measurement_density, unit="rad² s")
-    if walk == 0.0 and instability == 0.0:
-        raise InputError(
-            "the specification has neither flicker nor a drifting bias, so its filter has no bandwidth; add one of them"
-        )
-    return _natural_frequency(walk, instability**2, density)
 
 
 def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[str, float]:

@@ -63,7 +63,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     )
     increments, bias = output.increments, output.bias
     if spec.drop_probability > 0.0:
-        lost = gyro.dropped(spec, len(increments), generator(seed, run, "gyro losses"))
+        lost = generator(seed, run, "gyro losses").random(len(increments)) < spec.drop_probability
         increments, left = gyro.bridge_dropped(increments, stamps, lost)
         edges, stamps, bias = edges[left], stamps[left], bias[left]
         temperature = None if temperature is None else temperature[left]
