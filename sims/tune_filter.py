@@ -83,7 +83,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
 
 
 def draw(result, folder):
-    """Write the figures: searches, slices, values against the truth, held-out innovations."""
+    """Write the figures: searches, slices, values against the truth."""
     from strapdown import plots
     from strapdown.plots import tuning as drawing
 
@@ -98,10 +98,6 @@ def draw(result, folder):
     plots.save(
         drawing.likelihood_slices(tuning.slices(tuned), tuned),
         folder / "tune_filter-likelihood.png",
-    )
-    plots.save(
-        drawing.before_and_after(result.held_out, title="Held-out data, from a filter whose σ were 30 times too small"),
-        folder / "tune_filter-heldout.png",
     )
 
 

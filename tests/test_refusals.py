@@ -246,7 +246,7 @@ FILES = {
         ("x-run-3-record.h5", "x-run-3-estimate.h5"),
     ),
     "report": (["report", "run/estimate.h5", "--out"], "x.html", ("x.report.json",)),
-    "tune": (["tune", "record.h5", "--out"], "x.toml", ("x.json", "x-likelihood.png", "x-heldout.png")),
+    "tune": (["tune", "record.h5", "--out"], "x.toml", ("x.json", "x-likelihood.png")),
 }
 """Commands that write a file, its name, and what goes beside it."""
 

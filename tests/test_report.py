@@ -200,7 +200,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert "data:image/png" not in content  # the charts are drawn by the browser
     assert "[filter]" in content
-    slices, nis, nees, _ = charts_of(content)
+    (slices,) = charts_of(content)
     x, high, _, fallen, tuned, _ = columns(slices)
     assert slices["x"] == "star 1.sigma, arcsec"
     assert np.abs(fallen[np.isfinite(tuned)]).max() < 0.01  # no decrease at the tuned value
@@ -208,25 +208,15 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     edges = np.array([parameter["lower"], parameter["upper"]]) / parameter["si_per_unit"]
     np.testing.assert_allclose(x[np.isfinite(high)][[0, -1]], edges, rtol=1e-6)
     np.testing.assert_allclose(np.interp(edges, x, fallen), 3.84, rtol=0.2)  # one parameter: a likelihood ratio
-    for chart, course in zip(
-        (nis, nees), json.loads((tmp_path / "filter.json").read_text())["held_out"]["after"]["over_time"], strict=False
-    ):
-        assert chart["title"] == course["of"]
-        time, top, _, _, after = columns(chart)
-        np.testing.assert_allclose(time, course["time_s"], atol=1e-5)
-        np.testing.assert_allclose(top, course["bounds"][1], rtol=1e-9)
-        np.testing.assert_allclose(after, np.array(course["mean"], float), atol=1e-3)
     if headless.CHROMIUM is not None:
         reported = headless.reported(tmp_path / "filter.html", DRAWN, 1000, "--virtual-time-budget=20000")
-        assert (reported["drawn"], reported["console"]) == ("4", [])
+        assert (reported["drawn"], reported["console"]) == ("1", [])
     with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
-    assert (tmp_path / "filter-heldout.png").exists()
     assert CliRunner().invoke(cli.app, tune).exit_code == 0
-    assert not (tmp_path / "filter-heldout.png").exists()
     content = body(report.write(tmp_path / "filter.json").page)
-    assert len(charts_of(content)) == 1
+    assert ", on held-out data" not in content
     assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
 
 

@@ -197,7 +197,7 @@ def test_tables_hold_the_numbers_of_the_json(written):
 
 def test_figures_are_written_in_the_format_asked_for(written):
     figures = {str(path.relative_to(written)) for path in written.rglob("*") if path.suffix in (".png", ".pdf", ".svg")}
-    svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood", "filter-heldout"}
+    svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood"}
     pdf = {"covariance/budget", "estimate/estimate", "estimate/errors"}
     assert figures == {*(f"{x}.svg" for x in svg), *(f"{x}.pdf" for x in pdf)}
 

@@ -61,7 +61,7 @@ def tune(
     start: _Filter,
     goal: _Objective,
     layout: Layout,
-    out: Path = Option(Path("filter.toml"), "--out", "-o", help="TOML for --filter; beside it JSON and figures."),
+    out: Path = Option(Path("filter.toml"), "--out", "-o", help="TOML for --filter; beside it JSON and figure."),
     form: Format = FORMAT,
 ) -> None:
     """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
@@ -70,9 +70,9 @@ def tune(
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
             raise InputError(f"{path} is given twice; give each record once")
-    beside = out.with_suffix(".json")
+    beside, drawing = out.with_suffix(".json"), out.with_name(f"{out.stem}-likelihood.{form}")
     ui.check_files(out, suffixes=(".toml",), own=lambda _: tunings.read(beside))
-    ui.check_files(beside, *sd.plots.tuning.figure_paths(out, form), own=tunings.read)
+    ui.check_files(beside, drawing, own=tunings.read)
     sources: dict[str, Any] = {}
     for path in records:
         simulated = sd.recordings.is_record(path)
@@ -91,4 +91,4 @@ def tune(
     write_json(beside, {"records": list(sources), **result.summary(), "slices": slices.summary()})
     answer, reason, details = result.verdict
     ui.say(f"{answer}: {reason}.", *(f"  - {detail}" for detail in details if result.comparison is not None))
-    ui.written(out, beside, *sd.plots.draw_tuning(result, slices, out, form))
+    ui.written(out, beside, *sd.plots.save_as({drawing: sd.plots.likelihood_slices(slices, result)}, form))

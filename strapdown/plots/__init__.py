@@ -10,7 +10,7 @@ Colours are those of Okabe and Ito, distinguishable with colour vision deficienc
 - ``coning``: The coning study.
 - ``allan``: Allan deviations with fits.
 - ``budget``: Predicted errors by source.
-- ``tuning``: Likelihood slices, and statistics before and after tuning.
+- ``tuning``: Likelihood slices.
 """
 
 from strapdown.checks import InputError
@@ -60,6 +60,6 @@ from strapdown.plots.style import (
     save,
     save_as,
 )
-from strapdown.plots.tuning import draw_tuning
+from strapdown.plots.tuning import likelihood_slices
 
 __all__ = ["allan_overview", "error_budget", "error_overview", "nees_over_time", "new_figure", "nis_over_time", "save"]

@@ -1,18 +1,13 @@
-"""Tuning: the likelihood along each parameter, and the filter before and after tuning on held-out data."""
+"""Tuning: the likelihood along each parameter."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from strapdown.checks import Array
 from strapdown.plots import style
-from strapdown.tuning import Comparison, Slices, Tuning
+from strapdown.tuning import Slices, Tuning
 
 TALLEST = 15.0
 """Upper limit of the slices, −2 Δ log likelihood."""
@@ -72,52 +67,3 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
             ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
     style.legend_below(figure, list(axes.ravel()), ncols=5)
     return figure
-
-
-def figure_paths(beside: Path, form: str) -> tuple[Path, Path]:
-    """Return the paths of the figures beside a filter: of the likelihood, and of the held-out data."""
-    return beside.with_name(f"{beside.stem}-likelihood.{form}"), beside.with_name(f"{beside.stem}-heldout.{form}")
-
-
-def draw_tuning(tuning: Tuning, slices: Slices, beside: Path, form: str = "png") -> list[Path]:
-    """Write the figures of a tuning beside its filter, in place of those of an earlier one; return the files."""
-    likelihood, heldout = figure_paths(beside, form)
-    figures = {likelihood: likelihood_slices(slices, tuning)}
-    if tuning.comparison is not None:
-        figures[heldout] = before_and_after(tuning.comparison, title="Held-out part of the first record")
-    for other in style.FORMATS:
-        heldout.with_suffix(f".{other}").unlink(missing_ok=True)
-    return style.save_as(figures, form)
-
-
-def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
-    """Draw NIS, and NEES if there is a truth, on the held-out data before and after tuning, with the bounds of a consistent filter."""
-    both = (("before", comparison.before, style.VERMILION), ("after", comparison.after, style.BLUE))
-    rows = len(comparison.after.courses)
-    figure, axes = style.new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
-    for number, course in enumerate(comparison.after.courses):
-        drawn = []
-        for name, performance, color in both:
-            own = performance.courses[number]
-            drawn.append((name, color, float(np.nanmean(own.mean)) if number else performance.nis, own.time, own.mean))
-        _course(axes[number, 0], drawn, course.bounds, course.label)
-    figure.suptitle(title)
-    axes[-1, 0].set_xlabel("time, s")
-    return figure
-
-
-def _course(
-    ax: Axes, courses: Sequence[tuple[str, str, float, Array, Array]], bounds: tuple[float, float], label: str
-) -> None:
-    """Draw means over intervals of time, whose expectation is 1 for a consistent filter, before and after tuning."""
-    for name, color, mean, time, values in courses:
-        there = np.isfinite(values)
-        ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")
-    ax.axhspan(*bounds, color=style.ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
-    finite = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
-    if finite.max() > 5.0 or finite.min() < 0.2:
-        style.log_scale(ax)
-        label += "\n(log scale)"
-    ax.axhline(1.0, color=style.ink(), linewidth=0.6, linestyle=":")
-    ax.set_ylabel(label)
-    style.legend_above(ax)

@@ -59,28 +59,11 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
         charts = {}
         if "slices" in content:  # of the command
             charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
-        if content.get("held_out"):
-            charts["Held-out data"] = _over_time(content["held_out"])
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: {error} does not fit a tuning; give the JSON that `strapdown tune` writes beside its filter.toml"
         ) from None
     return content, listed, charts
-
-
-def _over_time(held: dict[str, Any]) -> list[str]:
-    """Return a chart of each statistic over the first record, before and after tuning, with the bounds of a consistent filter."""
-    charts = []
-    for before, after in zip(*(held[name].get("over_time", []) for name in ("before", "after")), strict=True):
-        time, (low, high) = np.array(after["time_s"]), after["bounds"]
-        means = [np.array(course["mean"], float) for course in (before, after)]
-        bounds = (np.full(len(time), low), np.full(len(time), high))
-        series = page.band(*bounds, ("99 % bounds, each interval", "lower bound"))
-        series.append(page.Series(label="before", value=means[0], colour="--b", dash=True))
-        series.append(page.Series(label="after", value=means[1]))
-        wide = np.nanmax(means) > 5.0 or np.nanmin(means) < 0.2
-        charts.append(page.chart(after["of"], "mean over the interval", time, series, log=bool(wide)))
-    return charts
 
 
 def _slice(curve: dict[str, Any], parameter: dict[str, Any]) -> str:

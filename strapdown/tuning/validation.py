@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,17 +16,13 @@ from strapdown.consistency import Judgement, mean_bounds
 from strapdown.estimation import setup
 from strapdown.estimation.schedule import selected
 from strapdown.estimation.setup import FilterSetup
-from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records import Estimate, Truth
 from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 
-BINS = 40
-"""Number of time bins of the averaged NIS and NEES."""
 MAX_ROWS = 20_000
 """Maximum number of states of a record that are judged."""
-MIN_ERRORS = 100
-"""Minimum number of errors against a truth for their NEES over time to be reported."""
 
 
 def split(cases: Sequence[Case], share: float) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
@@ -54,25 +51,6 @@ def split(cases: Sequence[Case], share: float) -> tuple[tuple[Case, ...], tuple[
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Course:
-    """NIS, or NEES of some states, over the time of a record."""
-
-    of: str
-    """"NIS", or the states of the NEES: "attitude" or "bias"."""
-    time: Array
-    """Midpoints of the time bins (k,), s."""
-    mean: Array
-    """Mean per degree of freedom in each bin (k,), 1 for a consistent filter; NaN without measurements or truth."""
-    bounds: tuple[float, float]
-    """Two-sided 99 % bounds of the mean in one bin for a consistent filter."""
-
-    @property
-    def label(self) -> str:
-        """What is averaged, in words."""
-        return "NIS per degree of freedom" if self.of == "NIS" else f"NEES of the {self.of}, per state"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Performance:
     """Performance of a filter on held-out data."""
 
@@ -82,28 +60,29 @@ class Performance:
     """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]
     """Two-sided 99 % bounds of the mean NIS."""
-    anees: float
-    """NEES per state of attitude and bias, averaged over time and records; NaN without a truth."""
+    nees: dict[str, float]
+    """NEES per state, averaged over time and records, of all states, attitude and bias; of those whose truth is known."""
     attitude_rms: float
     """RMS of the attitude error (all axes together), rad; NaN without a truth."""
     judgements: tuple[Judgement, ...]
     """The verdict on each record."""
-    courses: tuple[Course, ...]
-    """NIS over the time of the first record, and NEES of attitude and bias if their truth is known."""
+
+    @property
+    def anees(self) -> float:
+        """NEES per state of attitude and bias; NaN without a truth of both."""
+        return self.nees.get("state", math.nan)
 
     @property
     def row(self) -> tuple[Any, ...]:
         """Row of the table :meth:`Comparison.listing`."""
         verdicts = [judgement.verdict for judgement in self.judgements]
-        anees = figure(self.anees, 3)
-        if self.courses[1:] and not np.isfinite(self.anees):  # the reference has no bias
-            anees = f"{figure(float(np.nanmean(self.courses[1].mean)), 3)} (attitude)"
+        attitude_alone = list(self.nees) == ["attitude"]
         return (
             self.log_likelihood,
             self.nis,
             f"{self.nis_bounds[0]:.3f} to {self.nis_bounds[1]:.3f}",
             *self.nis_bounds,
-            anees,
+            f"{figure(self.nees['attitude'], 3)} (attitude)" if attitude_alone else figure(self.anees, 3),
             self.anees,
             self.attitude_rms / DEGREE,
             self.attitude_rms,
@@ -149,11 +128,9 @@ class Comparison(Listed):
                 "nis_bounds": performance.nis_bounds,
                 "anees_per_state": performance.anees,
                 "attitude_rms_rad": performance.attitude_rms,
-                "nees_per_state": {course.of: np.nanmean(course.mean) for course in performance.courses[1:]},
-                "over_time": [
-                    {"of": course.label, "time_s": course.time, "mean": course.mean, "bounds": course.bounds}
-                    for course in performance.courses
-                ],
+                "nees_per_state": {
+                    name: performance.nees[name] for name in ("attitude", "bias") if name in performance.nees
+                },
                 "judgements": [judgement.summary() for judgement in performance.judgements],
             }
             for name, performance in (("before", self.before), ("after", self.after))
@@ -198,27 +175,29 @@ def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance
         total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * s) + e**2 / s))
         number += e.size
         squares += float(innovations.nis[innovations.used].sum())
-    nees, error_squares = [], []
+    nees: dict[str, list[Array]] = {}
+    error_squares = []
     for estimate, truth in judged:
-        if truth is not None and truth.has_bias:
-            error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-            assert estimate.covariance is not None
-            nees.append(consistency.nees(error, estimate.covariance))
-            error_squares.append(np.sum(error[:, :3] ** 2, axis=1))
-        elif truth is not None:
-            errors = consistency.reference_errors(estimate.attitude, truth.attitude).total
-            error_squares.append(errors[np.isfinite(errors)] ** 2)
+        if truth is None:
+            continue
+        known, size = truth.known, 6 if truth.has_bias else 3
+        assert estimate.covariance is not None
+        attitude, bias, P = (part[known] for part in (estimate.attitude, estimate.bias, estimate.covariance))
+        error = consistency.errors(attitude, bias, truth.attitude[known], truth.bias[known])
+        error_squares.append(np.sum(error[:, :3] ** 2, axis=1))
+        for name in consistency.SUBSETS if truth.has_bias else ("attitude",):
+            states = consistency.SUBSETS[name]
+            nees.setdefault(name, []).append(consistency.nees(error[:, :size], P[:, :size, :size], states))
     return Performance(
         log_likelihood=total / number,
         nis=squares / number,
         nis_bounds=mean_bounds(1, number, 0.99),
-        anees=float(np.mean(np.concatenate(nees)) / 6.0) if nees else float("nan"),
-        attitude_rms=float(np.sqrt(np.mean(np.concatenate(error_squares)))) if error_squares else float("nan"),
+        nees={name: float(np.mean(np.concatenate(x)) / len(consistency.SUBSETS[name])) for name, x in nees.items()},
+        attitude_rms=float(np.sqrt(np.mean(np.concatenate(error_squares)))) if error_squares else math.nan,
         judgements=tuple(
             consistency.judge(estimate, truth if truth is not None and truth.has_bias else None)
             for estimate, truth in judged
         ),
-        courses=(_nis_course(judged[0][0].innovations.values()), *_nees_courses(*judged[0])),
     )
 
 
@@ -247,45 +226,3 @@ def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | No
     if truth is not None:
         truth = truth.taken(slice(None, None, every)).taken(inside)
     return replace(estimate, innovations=innovations, **part), truth
-
-
-def _spans(time: Array, first: float, last: float) -> tuple[Array, np.ndarray]:
-    """Return the midpoints of equal time bins (BINS,), and the bin of each time."""
-    edges = np.linspace(first, last + 1e-9, BINS + 1)
-    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, BINS - 1)
-    return 0.5 * (edges[1:] + edges[:-1]), place
-
-
-def _nis_course(innovations: Iterable[Innovations]) -> Course:
-    parts = [(part.time[part.used], part.nis[part.used], part.innovation.shape[1]) for part in innovations]
-    time, nis, degrees = (
-        np.concatenate(column)
-        for column in zip(*((time, nis, np.full(len(time), float(rows))) for time, nis, rows in parts), strict=True)
-    )
-    middles, place = _spans(time, time.min(), time.max())
-    in_bins = np.bincount(place, degrees, BINS)
-    typical = max(1, round(float(np.median(in_bins[in_bins > 0]))))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.bincount(place, nis, BINS) / in_bins
-    return Course(of="NIS", time=middles, mean=mean, bounds=mean_bounds(1, typical, 0.99))
-
-
-def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[Course, ...]:
-    if truth is None or int(truth.known.sum()) < MIN_ERRORS:
-        return ()
-    assert estimate.covariance is not None
-    known, size = truth.known, 6 if truth.has_bias else 3
-    error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known])
-    time, error, P = estimate.time[known], error[:, :size], estimate.covariance[known, :size, :size]
-    middles, place = _spans(time, time[0], time[-1])
-    number = np.bincount(place, minlength=BINS)
-    courses = []
-    for name in ("attitude", "bias") if truth.has_bias else ("attitude",):
-        states = consistency.SUBSETS[name]
-        average = consistency.time_average(error, P, states)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(place, consistency.nees(error, P, states), BINS) / (len(states) * number)
-        # Errors of one run are correlated: of those in a bin fewer are independent.
-        bounds = mean_bounds(3, max(average.effective / BINS, 1.0), 0.99)
-        courses.append(Course(of=name, time=middles, mean=mean, bounds=bounds))
-    return tuple(courses)
