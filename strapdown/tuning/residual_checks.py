@@ -28,12 +28,13 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.tuning import diagnosis
 from strapdown.tuning.diagnosis import Cause
-from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, PLAUSIBLE, gyro_error, turns
+from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, PLAUSIBLE, gyro_error, shown, turns
 from strapdown.tuning.diagnosis.likelihood import Model, by_mean, log_p, run
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
 from strapdown.tuning.result import Tuning
 from strapdown.tuning.validation import performance
+from strapdown.vectors import VectorMeasurements
 
 PROBABILITY = 0.99
 """Probability that a filter that models all errors passes all tests."""
@@ -95,18 +96,15 @@ class Unmodelled:
         ]
         if self.moves_with_the_rate:
             cause = self.scale_factor
-            sizes = ", ".join(
-                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(cause.estimate, cause.standard_error, strict=True)
-            )
             sentences.append(
-                f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {cause.gain:.3g}, "
-                f"p = {cause.finding.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
+                f"A scale factor of the gyro of {shown(cause.estimate, 1e6)} ± {shown(cause.standard_error, 1e6)} ppm explains the "
+                f"innovations better than its noise does (gain {cause.gain:.3g}, p = {cause.finding.p_value:.1g}): the tuned noise of the "
+                "gyro covers it. Calibrate it, or add a state for it."
             )
         sentences += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MAX_REPORTED]]
-        if len(self.failed) > MAX_REPORTED:
-            sentences.append(
-                f"And {len(self.failed) - MAX_REPORTED} more of {len(self.judgement.findings)} tests contradict the tuned filter."
-            )
+        left = len(self.failed) - MAX_REPORTED
+        if left > 0:
+            sentences.append(f"And {left} more of {len(self.judgement.findings)} tests contradict the tuned filter.")
         if self.causes:
             sentences.append(f"Most likely cause: {self.causes[0].words}.")
         if self.missing:
@@ -163,23 +161,19 @@ def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> Tuni
 
     The random walk of the bias has a note if a scale factor explains the innovations better.
     """
-    series = [vectors for case in cases for vectors in case.record.vectors]
     by_axis = any(  # the search for causes supports one σ per sample only
-        vectors.anisotropic
-        or (vectors.kind != "attitude" and isinstance(tuning.setup.sigma.get(vectors.sensor), tuple))
-        for vectors in series
+        series.anisotropic or (series.kind != "attitude" and isinstance(tuning.setup.sigma.get(series.sensor), tuple))
+        for case in cases
+        for series in case.record.vectors
     )
     if before.states is not None or by_axis:
         return tuning
     tested = tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
-    parameters = tuning.parameters
-    if any(check.moves_with_the_rate for check in tested):
-        doubt = "in doubt: may cover a scale factor of the gyro"
-        parameters = tuple(
-            replace(parameter, note=doubt) if parameter.name == RRW and parameter.identified else parameter
-            for parameter in parameters
-        )
-    return replace(tuning, parameters=parameters, unmodelled=tested)
+    parameters = list(tuning.parameters)
+    for j, parameter in enumerate(parameters):
+        if parameter.name == RRW and parameter.identified and any(check.moves_with_the_rate for check in tested):
+            parameters[j] = replace(parameter, note="in doubt: may cover a scale factor of the gyro")
+    return replace(tuning, parameters=tuple(parameters), unmodelled=tested)
 
 
 def record_for_tuning(case: Case) -> ImuRecord:
@@ -191,13 +185,14 @@ def record_for_tuning(case: Case) -> ImuRecord:
 
 def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
     """Return a record without the measurements that the gate of an estimate refused."""
-    kept = []
-    for series in record.vectors:
+
+    def left(series: VectorMeasurements) -> VectorMeasurements:
         innovations = estimate.innovations.get(series.sensor)
-        kept.append(
-            series if innovations is None else series.taken(~np.isin(series.time, innovations.time[~innovations.used]))
-        )
-    return replace(record, vectors=tuple(kept))
+        if innovations is None:
+            return series
+        return series.taken(~np.isin(series.time, innovations.time[~innovations.used]))
+
+    return replace(record, vectors=tuple(map(left, record.vectors)))
 
 
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Cause:
@@ -209,7 +204,7 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
     for level in levels:
         less = replace(noise, rate_random_walk=level * noise.rate_random_walk)
         model = Model(record=record, noise=less, initial=initial)
-        base = tuned if level == 1.0 else run(model)
+        base = run(model)
         cause = by_mean(model, base, hypothesis)
         # The gain of a smaller random walk alone, if it was not tuned, is not due to the scale factor.
         gain = cause.gain + min(base.gain_over(tuned), 0.0) - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))

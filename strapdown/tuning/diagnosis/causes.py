@@ -24,9 +24,7 @@ class Cause:
     Parameters
     ----------
     name : str
-        Fault: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard
-        iron", "body-fixed bias", "mounting", "misalignment", "scale factor", "reference length", "reference direction",
-        "initial attitude", "initial bias", "commutation", "wrong convention".
+        Fault, such as "R too small", "time offset" or "hard iron".
     of : str
         Object with the fault: a sensor, "gyro", …
     estimate : ndarray (k,)
@@ -106,13 +104,10 @@ class Diagnosis(Listed):
         if not self.causes:
             return "No cause among those considered is significant."
         first = self.alternatives
-        if len(first) == 1:
-            lines = [f"Most likely cause: {first[0].words}"]
-        else:
-            lines = [
-                "One of these causes, which the data do not distinguish:",
-                *(f"  - {cause.words}" for cause in first),
-            ]
+        lines = [f"Most likely cause: {first[0].words}"]
+        if len(first) > 1:
+            heading = "One of these causes, which the data do not distinguish:"
+            lines = [heading, *(f"  - {cause.words}" for cause in first)]
         lines += [f"  then, unless a side effect of the first:  {cause.words}" for cause in self.causes[len(first) : 4]]
         return "\n".join(lines)
 

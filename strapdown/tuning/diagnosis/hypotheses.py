@@ -13,6 +13,7 @@ from strapdown.ahrs.check_conventions import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.checks import Array
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
+from strapdown.results import figure
 from strapdown.tuning.diagnosis.causes import Cause
 from strapdown.tuning.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
 from strapdown.vectors import VectorMeasurements
@@ -25,7 +26,7 @@ UNLIKELY = 0.01
 
 def shown(theta: Array, factor: float = 1.0) -> str:
     """Return numbers in brackets with three digits each."""
-    return "[" + ", ".join(f"{x * factor:.3g}" for x in theta) + "]"
+    return f"[{', '.join(figure(float(x * factor), 3) for x in theta)}]"
 
 
 def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
