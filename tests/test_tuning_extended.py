@@ -84,7 +84,7 @@ EVERY_STATE = {
     "sensors": (
         OF_SENSORS,
         {"sun": (1e-2, 2e-2, 1e-2)},
-        ("gyro.rrw", "initial.attitude", "initial.bias", "sun.sigma.y"),
+        ("gyro.rrw", "initial.attitude", "initial.bias", "sun.sigma"),
     ),
 }
 
@@ -409,6 +409,6 @@ def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
     size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad, or the vector's unit": 1.0}
     size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
     size |= {"°/h/K": degree / 3600.0, "°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
-    names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters._WHOLE)
+    names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters.WHOLE)
     for name in (*names, *(f"mag.{state}" for state in parameters.SENSOR_STATES)):
         assert parameters.unit_of(name).factor == pytest.approx(size[parameters.unit_of(name).name], rel=1e-12), name

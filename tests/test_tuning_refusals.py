@@ -69,9 +69,6 @@ TABLE = [
     (tuning.Prior, (), {"value": 1.0, "factor": 1.0}, "factor of the prior is 1.0; .* greater than 1"),
     (tuning.fit, (free(*FREE),), {"priors": UNSPECIFIED}, "priors"),
     (setup.modelled_record, (HELD.record, AXES), {}, "mag is .*three numbers, but a heading has one degree of freedom"),
-    (of_compass, ("mag.sigma.x",), {}, r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"),
-    (of_compass, ("acc.sigma", "acc.sigma.y"), {}, "acc.sigma.y is part of acc.sigma; give that, or the axes"),
-    (of_compass, ("axc.sigma.x",), {}, "did you mean 'acc.sigma.x'"),
     (of_compass, ("acc.correlated_time",), {"filter_setup": COLOURED}, "did you mean 'acc.correlation_time'"),
     (of_compass, ("acd.bias_sigma",), {"filter_setup": OF_ANOTHER}, "did you mean 'acc'"),
     (mixed, (), {"share": 0.6}, "share of the outliers is 0.6; it must lie between 0.0001 and 0.4"),
@@ -91,7 +88,6 @@ def test_what_makes_no_sense_is_refused_by_name(call, arguments, options, named)
 
 
 def test_what_is_near_it_is_taken():
-    assert not any(name.startswith("mag") for name in tuning.parameters.axis_names([HELD.record]))
     three = replace(MATCHED, sigma={"acc": (0.05, 0.05, 0.1)})
     assert covariance.analyse(COMPASS, three, epochs=2).expected_nis["acc"] > 0.0
     assert tuning.parameters.own_sigma("star 2", [SILENT]) == pytest.approx(2e-4)

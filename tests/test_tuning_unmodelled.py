@@ -76,7 +76,7 @@ def test_of_right_filters_hardly_one_is_suspected():
         gains.append(unmodelled.scale_factor.gain)
         if not unmodelled.suspected:
             assert unmodelled.words == ()
-            assert examined.parameters is result.parameters
+            assert examined.parameters == result.parameters
     assert suspected <= 1
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
 

@@ -21,7 +21,7 @@ class _Filter:
 
     free: list[str] | None = Option(
         None,
-        help="Parameters to tune, separated by commas or repeated: gyro.arw, gyro.rrw, SENSOR.sigma[.x, .y, .z], initial.attitude, "
+        help="Parameters to tune, separated by commas or repeated: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, "
         "initial.bias, gate.probability; or only filter.scale, as for a recording without --truth. Default: gyro and every sensor.",
     )
     filter_file: Path | None = FILTER

@@ -46,7 +46,7 @@ from strapdown.tuning.objective import (
     make_problem,
     outliers_at,
 )
-from strapdown.tuning.parameters import ARW, AXES, RRW, SCALE, SIGMA, axis_of
+from strapdown.tuning.parameters import ARW, RRW, SCALE, SIGMA
 
 MAX_DERIVATIVES = WIDTH - 1
 """Maximum number of derivatives in one pass over a record."""
@@ -193,11 +193,7 @@ class Likelihood(Objective):
 
     def _filters(self, case: Prepared, points: Array) -> list[tuple[Model, State]]:
         """Return model and initial state of the filter of each point; gyro noise, σ of sensors and outliers leave them as they are."""
-        others = [
-            j
-            for j, name in enumerate(self.names)
-            if not (name in (ARW, RRW, *OUTLIERS) or name.endswith(SIGMA) or axis_of(name))
-        ]
+        others = [j for j, name in enumerate(self.names) if not (name in (ARW, RRW, *OUTLIERS) or name.endswith(SIGMA))]
         if not others:
             return [case.filter] * len(points)
         _, first, place = np.unique(points[:, others], axis=0, return_index=True, return_inverse=True)
@@ -209,14 +205,10 @@ class Likelihood(Objective):
     def _factors(self, case: Prepared, lane: dict[str, Array]) -> Array:
         """Return the factors on σ about each axis of each sensor (sensors, 3, WIDTH)."""
         base = dict(zip(self.names, np.exp(self.start), strict=True))
-        sensors = case.problem.events.sensors
-        factors = np.empty((len(sensors), 3, WIDTH))
-        factors[:] = lane.get(SCALE, 1.0)
-        for factor, sensor in zip(factors, sensors, strict=True):
-            for i, suffix in enumerate((*AXES, SIGMA)):
-                if sensor + suffix in lane:
-                    factor[i if i < 3 else ...] = lane[sensor + suffix] / base[sensor + suffix]
-        return factors
+        names = [f"{sensor}{SIGMA}" for sensor in case.problem.events.sensors]
+        common = lane.get(SCALE, np.ones(WIDTH))
+        factors = np.array([lane[name] / base[name] if name in lane else common for name in names])
+        return np.repeat(factors[:, None], 3, axis=1)
 
     def _body(self, case: Prepared, points: Array) -> kernel.Body:
         """Return the filters of up to eight points (k, p); those of the first fill the lanes that remain."""
@@ -327,9 +319,8 @@ def likelihood(
     filter_setup : FilterSetup
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
-        Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"SENSOR.sigma.x"`` (about one body axis),
-        ``"initial.attitude"``, ``"initial.bias"``, those of the filter's error states such as ``"gyro.scale_sigma"`` and
-        ``"SENSOR.correlation_time"``, or ``"filter.scale"`` alone.
+        Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"initial.attitude"``, ``"initial.bias"``, those of the
+        filter's error states such as ``"gyro.scale_sigma"`` and ``"SENSOR.correlation_time"``, or ``"filter.scale"`` alone.
     spacing : float, default 0
         Minimum time between the measurements of a sensor that are used, s; these have the weight of all. For correlated disturbances: this
         likelihood holds for white innovations only.

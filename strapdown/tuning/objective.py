@@ -25,7 +25,6 @@ from strapdown.tuning.parameters import (
     OUTLIER_SHARE,
     Prior,
     Unit,
-    by_axis,
     checked_names,
     unit_of,
     values_of,
@@ -221,7 +220,6 @@ def make_problem(
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]
     names = checked_names(free, filter_setup, records)
-    filter_setup = by_axis(filter_setup, names, records)
     values = values_of(filter_setup, names, records)
     for name, value in values.items():
         if value <= 0.0:

@@ -3,25 +3,23 @@
 The gyro's axes share two noise parameters, because the filter has one σ_v and one σ_u: only isotropic noise is invariant to rotations of
 the body within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
 
-``SENSOR.sigma`` is the root mean square of the σ of all axes; their ratios are those of the setup or the record.
-``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about each body axis (along it, for full vectors), for any sensor except a heading. The gyro
-has no such names, for the reason above. The σ and times of a filter's optional states (:data:`GYRO_STATES`, :data:`SENSOR_STATES`) scale
-all axes or drifts of a state together; their value is the root mean square.
+``SENSOR.sigma`` is the root mean square of the σ of all axes; their ratios are those of the setup or the record. The σ and times of a
+filter's optional states (:data:`GYRO_STATES`, :data:`SENSOR_STATES`) scale all axes or drifts of a state together; their value is the root
+mean square.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from strapdown import gyro, units
-from strapdown.checks import Array, InputError, one_of, positive
+from strapdown.checks import InputError, one_of, positive
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
-from strapdown.estimation.setup.filter_setup import Sigma
 from strapdown.estimation.setup.states import VELOCITY, SensorStates, States
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
@@ -44,50 +42,45 @@ OUTLIER_SCALE = "outliers.scale"
 SIGMA = ".sigma"
 """Suffix of a sensor's σ."""
 
-AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
-"""Suffixes of a sensor's σ for one body axis."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Unit:
+class Unit(NamedTuple):
     """Unit in which a parameter is printed; ``factor`` converts to SI."""
 
     name: str
     factor: float
 
 
-_ONE, _SECOND = Unit(name="1", factor=1.0), Unit(name="s", factor=1.0)
-_PER_HOUR = Unit(name="°/h", factor=units.DEGREE_PER_HOUR)
-_PER_G = Unit(name="°/h/g", factor=units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY)
-_OF_SENSOR = Unit(name="rad, or the vector's unit", factor=1.0)
+_PER_HOUR = Unit("°/h", units.DEGREE_PER_HOUR)
+_PER_G = Unit("°/h/g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY)
+_OF_SENSOR = Unit("rad, or the vector's unit", 1.0)
 
 PLAIN = {
-    ARW: (("process_noise", "angle_random_walk"), Unit(name="°/√h", factor=units.DEGREE_PER_ROOT_HOUR)),
-    RRW: (("process_noise", "rate_random_walk"), Unit(name="°/h/√h", factor=units.DEGREE_PER_HOUR_PER_ROOT_HOUR)),
-    INITIAL_ATTITUDE: (("attitude_sigma",), Unit(name="°", factor=units.DEGREE)),
+    ARW: (("process_noise", "angle_random_walk"), Unit("°/√h", units.DEGREE_PER_ROOT_HOUR)),
+    RRW: (("process_noise", "rate_random_walk"), Unit("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR)),
+    INITIAL_ATTITUDE: (("attitude_sigma",), Unit("°", units.DEGREE)),
     INITIAL_BIAS: (("bias_sigma",), _PER_HOUR),
 }
 """Parameters of attitude and bias: field in a setup, and unit."""
 GYRO_STATES = {
-    "gyro.scale_sigma": (("states", "gyro_scale_sigma"), Unit(name="ppm", factor=1e-6)),
-    "gyro.misalignment_sigma": (("states", "gyro_misalignment_sigma"), Unit(name="mrad", factor=1e-3)),
+    "gyro.scale_sigma": (("states", "gyro_scale_sigma"), Unit("ppm", 1e-6)),
+    "gyro.misalignment_sigma": (("states", "gyro_misalignment_sigma"), Unit("mrad", 1e-3)),
     "gyro.force_sigma": (("states", "gyro_force_sigma"), _PER_G),
     "gyro.cross_force_sigma": (("states", "gyro_cross_force_sigma"), _PER_G),
-    "gyro.temperature_sigma": (("states", "gyro_temperature_sigma"), Unit(name="°/h/K", factor=units.DEGREE_PER_HOUR)),
+    "gyro.temperature_sigma": (("states", "gyro_temperature_sigma"), Unit("°/h/K", units.DEGREE_PER_HOUR)),
     "gyro.drift_sigma": (("states", "gyro_drift_sigma"), _PER_HOUR),
-    "gyro.drift_time": (("states", "gyro_drift_time"), _SECOND),
+    "gyro.drift_time": (("states", "gyro_drift_time"), Unit("s", 1.0)),
 }
 """Parameters of the gyro's optional states."""
 SENSOR_STATES = {
-    "mounting_sigma": ("mounting_sigma", Unit(name="mrad", factor=1e-3)),
+    "mounting_sigma": ("mounting_sigma", Unit("mrad", 1e-3)),
     "bias_sigma": ("bias_sigma", _OF_SENSOR),
     "correlated_sigma": ("correlated_sigma", _OF_SENSOR),
-    "correlation_time": ("correlation_time", _SECOND),
-    "lever_sigma": ("lever_arm_sigma", Unit(name="m", factor=1.0)),
-    **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
+    "correlation_time": ("correlation_time", Unit("s", 1.0)),
+    "lever_sigma": ("lever_arm_sigma", Unit("m", 1.0)),
+    **{name: (name, Unit(unit, 1.0)) for name, unit in VELOCITY.items()},
 }
 """Parameters of a sensor's optional states, named ``SENSOR.KEY``: field of :class:`.SensorStates`, unit."""
-_WHOLE = {SCALE: _ONE, OUTLIER_SHARE: Unit(name="%", factor=0.01), OUTLIER_SCALE: _ONE}
+WHOLE = {SCALE: Unit("1", 1.0), OUTLIER_SHARE: Unit("%", 0.01), OUTLIER_SCALE: Unit("1", 1.0)}
 """Units of the parameters that are no fields of a setup."""
 
 
@@ -113,29 +106,6 @@ def _put(owner: Any, path: Sequence[str], value: Any) -> Any:
     return {**owner, head: inner} if isinstance(owner, Mapping) else replace(owner, **{head: inner})
 
 
-def known_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names of all parameters of a filter on these records, except those of single axes and of optional states."""
-    sensors = dict.fromkeys(series.sensor for record in records for series in record.vectors if len(series.time))
-    return (*PLAIN, SCALE, *(f"{sensor}{SIGMA}" for sensor in sensors))
-
-
-def axis_of(name: str) -> tuple[str, int] | None:
-    """Return the sensor and axis of a name such as ``star.sigma.x``; None for another name."""
-    sensor, _, axis = name.rpartition(f"{SIGMA}.")
-    return (sensor, "xyz".index(axis)) if sensor and axis in ("x", "y", "z") else None
-
-
-def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names of the σ of single body axes, of every sensor except headings, which have one degree of freedom."""
-    series = [vectors for record in records for vectors in record.vectors if len(vectors.time)]
-    sensors = dict.fromkeys(vectors.sensor for vectors in series if vectors.sensor not in _headings(records))
-    return tuple(f"{sensor}{axis}" for sensor in sensors for axis in AXES)
-
-
-def _headings(records: Sequence[ImuRecord]) -> set[str]:
-    return {series.sensor for record in records for series in record.vectors if series.kind == "heading"}
-
-
 def state_names(states: States | None) -> tuple[str, ...]:
     """Return the names of the parameters of these states; none if there are no states."""
     if states is None:
@@ -147,23 +117,19 @@ def state_names(states: States | None) -> tuple[str, ...]:
 
 def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     """Return the default parameters: the gyro's two noises and the σ of every sensor."""
-    return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
+    sensors = dict.fromkeys(series.sensor for record in records for series in record.vectors if len(series.time))
+    return (ARW, RRW, *(f"{sensor}{SIGMA}" for sensor in sensors))
 
 
 def checked_names(free: Sequence[str], filter_setup: FilterSetup, records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the given names, checked: each is a parameter of this filter on these records, none repeats or includes another."""
-    known = [*known_names(records), *axis_names(records), *state_names(filter_setup.states)]
+    """Return the given names, checked: each is a parameter of this filter on these records, and none repeats."""
+    known = [*default_names(records), INITIAL_ATTITUDE, INITIAL_BIAS, SCALE, *state_names(filter_setup.states)]
     if not free:
         raise InputError(f"free names no parameter; give some of {', '.join(known)}")
     for name in free:
-        part = axis_of(name)
-        if part is not None and part[0] in _headings(records):
-            raise InputError(f"free: {name}: a heading has one degree of freedom; give {part[0]}{SIGMA}")
         one_of("free: parameter", name, known)
         if list(free).count(name) > 1:
             raise InputError(f"free names {name} twice; give it once")
-        if part is not None and f"{part[0]}{SIGMA}" in free:
-            raise InputError(f"free: {name} is part of {part[0]}{SIGMA}; give that, or the axes")
     if SCALE in free and len(free) > 1:
         raise InputError(f"{SCALE} scales all noise of the filter, other parameters included; tune it alone")
     return tuple(free)
@@ -174,54 +140,21 @@ def unit_of(name: str, records: Sequence[ImuRecord] = ()) -> Unit:
     place = _place(name)
     if place is not None:
         return place[1]
-    if name in _WHOLE:
-        return _WHOLE[name]
-    sensor = _sensor(name)
+    if name in WHOLE:
+        return WHOLE[name]
+    sensor = name.removesuffix(SIGMA)
     kinds = [series.kind for record in records for series in record.vectors if series.sensor == sensor]
     if kinds and kinds[0] == "vector":
-        return Unit(name="unit of the vector", factor=1.0)
+        return Unit("unit of the vector", 1.0)
     if own_sigma(sensor, records) > 0.1 * units.DEGREE:
-        return Unit(name="°", factor=units.DEGREE)
-    return Unit(name="arcsec", factor=units.ARCSECOND)
-
-
-def _sensor(name: str) -> str:
-    """Return the sensor of ``SENSOR.sigma`` or ``SENSOR.sigma.x``."""
-    part = axis_of(name)
-    return name.removesuffix(SIGMA) if part is None else part[0]
+        return Unit("°", units.DEGREE)
+    return Unit("arcsec", units.ARCSECOND)
 
 
 def own_sigma(sensor: str, records: Sequence[ImuRecord]) -> float:
     """Return the root mean square of a sensor's σ in the records, over all of its measurements."""
     squares = [np.square(series.sigma) for record in records for series in record.vectors if series.sensor == sensor]
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
-
-
-def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
-    """Return the root mean square of a sensor's σ in the records about each body axis (3,), over all of its measurements."""
-    series = [vectors for record in records for vectors in record.vectors if vectors.sensor == sensor]
-    squares = [np.einsum("kii->ki", vectors.covariances) for vectors in series]
-    return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0))) if squares else np.zeros(3)
-
-
-def by_axis(filter_setup: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> FilterSetup:
-    """Return the setup with three σ for each sensor of which ``names`` has an axis: those of the setup, or of the records."""
-    sigma = dict(filter_setup.sigma)
-    for sensor in dict.fromkeys(part[0] for part in map(axis_of, names) if part is not None):
-        present = sigma.get(sensor)
-        if isinstance(present, tuple):
-            continue
-        own = own_axes(sensor, records)
-        size = float(np.sqrt(np.mean(own**2)))
-        if present is None and size == 0.0:
-            raise _silent(sensor)
-        x, y, z = (own if present is None else present * (own / size if size > 0.0 else np.ones(3))).tolist()
-        sigma[sensor] = x, y, z
-    return replace(filter_setup, sigma=sigma)
-
-
-def _silent(sensor: str) -> InputError:
-    return InputError(f"{sensor}: its sigma is 0 in the records; give a starting value in [filter.sigma]")
 
 
 def _size(value: Any) -> float:
@@ -239,31 +172,25 @@ def _times(value: Any, factor: float) -> Any:
 
 def values_of(filter_setup: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
     """Return the values of the parameters in a setup."""
-    return {name: _value_of(filter_setup, name, records) for name in names}
-
-
-def _value_of(filter_setup: FilterSetup, name: str, records: Sequence[ImuRecord]) -> float:
-    place = _place(name)
-    if name == SCALE:
-        return 1.0
-    if place is not None:
-        return _size(_at(filter_setup, place[0]))
-    part, sensor = axis_of(name), _sensor(name)
-    if part is not None:
-        axes = by_axis(filter_setup, [name], records).sigma[sensor]
-        assert isinstance(axes, tuple)
-        return axes[part[1]] * filter_setup.measurement_sigma_factor
-    own = _size(filter_setup.sigma.get(sensor, own_sigma(sensor, records))) * filter_setup.measurement_sigma_factor
-    if own == 0.0:
-        raise _silent(sensor)
-    return own
+    values = {}
+    for name in names:
+        place, sensor = _place(name), name.removesuffix(SIGMA)
+        if name == SCALE:
+            values[name] = 1.0
+        elif place is not None:
+            values[name] = _size(_at(filter_setup, place[0]))
+        else:
+            sigma = _size(filter_setup.sigma.get(sensor, own_sigma(sensor, records)))
+            if sigma == 0.0:
+                raise InputError(f"{sensor}: its sigma is 0 in the records; give a starting value in [filter.sigma]")
+            values[name] = sigma * filter_setup.measurement_sigma_factor
+    return values
 
 
 def with_values(filter_setup: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
     """Return the setup with other values of these parameters; a σ is divided by the setup's factor.
 
-    ``SENSOR.sigma`` and the σ of states keep the ratios of their axes; ``SENSOR.sigma.x`` and the like need three in the setup
-    (:func:`by_axis`).
+    ``SENSOR.sigma`` and the σ of states keep the ratios of their axes.
     """
     if SCALE in values:
         return _scaled(filter_setup, values[SCALE])
@@ -271,7 +198,9 @@ def with_values(filter_setup: FilterSetup, values: Mapping[str, float]) -> Filte
     for name, value in values.items():
         place = _place(name)
         if place is None:
-            _set(sigma, name, value / filter_setup.measurement_sigma_factor)
+            sensor, own = name.removesuffix(SIGMA), value / filter_setup.measurement_sigma_factor
+            present = sigma.get(sensor)
+            sigma[sensor] = _times(present, own / _size(present)) if isinstance(present, tuple) else own
             continue
         present = _at(filter_setup, place[0])
         if name == "gyro.drift_sigma":  # the part with a bandwidth above that of the states is scaled with them
@@ -280,19 +209,6 @@ def with_values(filter_setup: FilterSetup, values: Mapping[str, float]) -> Filte
         several = place[0][0] == "states"
         filter_setup = _put(filter_setup, place[0], _times(present, value / _size(present)) if several else value)
     return replace(filter_setup, sigma=sigma)
-
-
-def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
-    """Set the σ of a sensor, keeping the ratios of its axes, or that of one axis."""
-    part, sensor = axis_of(name), _sensor(name)
-    present = sigma.get(sensor)
-    if part is None:
-        sigma[sensor] = _times(present, value / _size(present)) if isinstance(present, tuple) else value
-        return
-    if not isinstance(present, tuple):
-        raise InputError(f"{name}: the setup has no three sigmas for {sensor}; see tuning.parameters.by_axis")
-    x, y, z = (value if k == part[1] else axis_sigma for k, axis_sigma in enumerate(present))
-    sigma[sensor] = x, y, z
 
 
 Owner = TypeVar("Owner", FilterSetup, States, SensorStates)
