@@ -24,6 +24,7 @@ from scipy.stats import chi2, norm
 
 from sims import allan as sim
 from strapdown import allan, units
+from strapdown.allan import misfit
 from strapdown.checks import InputError
 from strapdown.kernels.allan import accumulate, second_difference_squares
 from strapdown.kernels.machine import compiled
@@ -600,7 +601,7 @@ def test_misfit_says_what(spoil, words):
 
 def test_scores_of_chi_squares_are_normal():
     ratio = np.random.default_rng(14).chisquare(6.0, (4000, 60)) / 6.0
-    probability = np.array([allan.noise_fit._probability(np.full(60, 6.0), row, 60) for row in ratio])
+    probability = np.array([misfit.chi_squared_probability(np.full(60, 6.0), row, 60) for row in ratio])
     assert 0.005 < np.mean(probability < 0.01) < 0.02
     assert 0.47 < np.mean(probability < 0.5) < 0.53
 
@@ -608,9 +609,11 @@ def test_scores_of_chi_squares_are_normal():
 def test_each_term_of_the_fit_costs_its_spectrum_a_degree():
     ratio = np.linspace(0.6, 1.5, 10)
     bins = types.SimpleNamespace(number=np.full(10, 50.0), square=50.0 * ratio, product=np.zeros(10), ramp=np.zeros(10))
-    best = types.SimpleNamespace(slope=0.0, variance=np.ones(10), theta=np.array([1.0, 0.0, 2.0, 3.0]))
+    bins.basis = np.eye(4)[0][:, None] * np.ones(10)
     score = (np.cbrt(ratio) - 1.0 + 2.0 / 450.0) / np.sqrt(2.0 / 450.0)
-    assert allan.noise_fit._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
+    assert misfit._of_spectrum(bins, np.array([1.0, 0.0, 2.0, 3.0]), 0.0)[0] == pytest.approx(
+        chi2.sf(score @ score, 7), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("highest_frequency", [None, 0.3])

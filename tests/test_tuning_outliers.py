@@ -72,7 +72,7 @@ def plain_mixture(share, scale, filter_setup, increments, angles, dt=0.5, sigma=
 
 
 def probabilities(objective: tuning.outliers.Likelihood, point: np.ndarray) -> np.ndarray:
-    return objective.judged(point)[0][1][:, 0]
+    return objective.outliers(point)[0][1][:, 0]
 
 
 def test_in_the_linear_case_it_is_the_filter_of_two_normals():
@@ -180,7 +180,7 @@ def test_noise_by_axis_that_is_the_same_for_all_axes_has_the_plain_mixture():
     )
     other = tuning.contaminated_likelihood([case], filter_setup, names, share=0.1)
     assert other.minus_log(other.start)[0] == pytest.approx(plain.minus_log(plain.start)[0], rel=1e-13)
-    for (_, probability), (_, expected) in zip(other.judged(other.start), plain.judged(plain.start), strict=True):
+    for (_, probability), (_, expected) in zip(other.outliers(other.start), plain.outliers(plain.start), strict=True):
         np.testing.assert_allclose(probability, expected, rtol=1e-9, atol=1e-12)
 
 

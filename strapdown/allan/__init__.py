@@ -2,6 +2,7 @@
 
 - ``deviation``: :func:`allan_deviation` with confidence intervals.
 - ``noise_fit``: :func:`fit_noise` by maximum likelihood, on the ``spectrum`` of the cosine transform.
+- ``misfit``: Whether a record has other errors than the fitted noise.
 - ``power_laws``: The power law of the noise, and degrees of freedom under it.
 - ``temperature``: Bias as a polynomial in temperature.
 - ``parameters``: Noise parameters of a six-axis unit in the formats of Kalibr, PX4 and MATLAB.

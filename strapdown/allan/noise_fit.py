@@ -26,16 +26,13 @@ from numpy.typing import NDArray
 
 from strapdown import checks, gyro, units
 from strapdown.allan.deviation import TERMS, AllanDeviation, Source, averaged, confidence, model_deviation
+from strapdown.allan.misfit import worst_misfit
 from strapdown.allan.spectrum import (
     Bins,
     Segment,
-    bin_slices,
     binned,
     cosine_transform,
-    expected_power,
-    inner,
     last_coefficient,
-    ramp_coefficients,
     scored,
     segment,
 )
@@ -102,8 +99,6 @@ MISFIT_PROBABILITY = 1e-3
 
 SHORTEST = 64
 """Minimum number of samples of a segment without gaps that the fit uses."""
-
-_STRETCHES = 64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,8 +279,9 @@ def fit_noise(
             raise InputError(
                 f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
             )
-        fits.append(fit_axis(whole, "rate_ramp" in in_order))
-        misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
+        fits.append(_fit_axis(whole, "rate_ramp" in in_order))
+        best = fits[-1].best
+        misfits.append(worst_misfit(coefficients, each, segments, best.theta, best.slope, random_terms, dt))
     estimate, lower, upper = _of_axes(fits, in_order, confidence_level)
     return NoiseFit(
         terms=in_order,
@@ -409,8 +405,7 @@ def _maximise(
         square = bins.square - 2.0 * point.slope * bins.product + point.slope**2 * bins.ramp
         return square + bins.ramp / (bins.ramp / point.variance).sum() if slope is None and restricted else square
 
-    at = lambda theta: _loss(bins, theta, slope, restricted)  # noqa: E731
-    return scored(bins, at, power, start, free)
+    return scored(bins, lambda theta: _loss(bins, theta, slope, restricted), power, start, free)
 
 
 def _first_guess(bins: Bins) -> Array:
@@ -422,7 +417,7 @@ def _first_guess(bins: Bins) -> Array:
     return np.asarray(np.min(np.maximum(power, 1e-9 * power.max()) / basis, axis=1) / len(basis))
 
 
-def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
+def _fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
     """Return the maximum-likelihood coefficients of each combination of terms on one axis."""
     slope, guess = None if with_ramp else -bins.first_slope, _first_guess(bins)
     combinations = {
@@ -522,89 +517,3 @@ def _ramp(fit: AxisFit, confidence_level: float) -> tuple[float, float, float]:
     if fall(-bins.first_slope) > 0.5 * float(chi2.ppf(1.0 - 2.0 * SUPPORT_PROBABILITY, 1)):
         return top.slope + bins.first_slope, low, high
     return math.nan, 0.0, max(abs(low), abs(high))
-
-
-# Misfit
-
-
-def _worst_misfit(
-    coefficients: Sequence[Array],
-    each: Sequence[Bins],
-    best: Optimum,
-    random_terms: tuple[str, ...],
-    segments: Sequence[Segment],
-    dt: float,
-) -> tuple[float, str]:
-    """Return the minimum probability of :func:`_misfit_of` over the segments, times their number, and its description."""
-    misfits = []
-    for coefficient, bins, part in zip(coefficients, each, segments, strict=True):
-        own = best._replace(variance=best.theta @ bins.basis)
-        probability, what = _misfit_of(coefficient, bins, own, random_terms, part, dt)
-        where = "" if len(segments) == 1 else f"in the segment from {part.place.start * dt:.6g} s "
-        misfits.append((probability, where + what))
-    probability, what = min(misfits, key=lambda misfit: misfit[0])
-    return min(1.0, len(misfits) * probability), what
-
-
-def _misfit_of(
-    coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], segment: Segment, dt: float
-) -> tuple[float, str]:
-    """Return the p-value of the deviation from the fit, and its description; overwrites ``coefficient``.
-
-    The coefficients divided by their fitted standard deviations and transformed back are a white series of unit variance. A rotation or a
-    step of the bias, whose spectrum may resemble that of a random walk, is an outlier in this series. The smallest p-value of three tests
-    is multiplied by three.
-    """
-    samples, last = len(coefficient), segment.last
-    for s in bin_slices(segment.starts, last):
-        j = np.arange(s.start, s.stop)
-        variance = np.zeros(len(j))
-        for term, theta in zip(random_terms, best.theta, strict=True):
-            if theta > 0.0:
-                variance += theta * expected_power(term, samples, dt, j)
-        coefficient[s] -= (bins.first_slope + best.slope) * dt * ramp_coefficients(samples, j)
-        coefficient[s] /= np.sqrt(variance)
-    from scipy.fft import idct
-
-    coefficient[0] = 0.0
-    coefficient[last + 1 :] = 0.0
-    white = idct(coefficient, type=2, norm="ortho", overwrite_x=True)
-    white *= math.sqrt(samples / last)
-    largest = max(int(np.argmax(white)), int(np.argmin(white)), key=lambda k: abs(white[k]))
-    size = abs(float(white[largest]))
-    stretches = min(_STRETCHES, samples // 16)
-    edges = np.linspace(0, samples, stretches + 1).astype(np.int64)
-    energy = np.array([inner(white[a:b], white[a:b]) for a, b in itertools.pairwise(edges)])
-    number = np.diff(edges)
-    freedom = number * (last / samples)
-    loudest = int(np.argmax(energy / number))
-    tests = (
-        (samples * math.erfc(size / math.sqrt(2.0)), f"a sample at {dt * largest:.6g} s is an outlier of {size:.3g} σ"),
-        (
-            _probability(freedom, energy / number, stretches - 1),
-            f"its noise is not stationary, and largest from {dt * edges[loudest]:.6g} to {dt * edges[loudest + 1]:.6g} s",
-        ),
-        (_spectrum_probability(bins, best), "its spectrum has another shape"),
-    )
-    probability, what = min(tests, key=lambda test: test[0])  # if several are 0, the first, which has a time
-    return min(1.0, len(tests) * probability), what
-
-
-def _spectrum_probability(bins: Bins, best: Optimum) -> float:
-    """Return the p-value of the spectrum, over the bins with enough coefficients."""
-    many = bins.number >= min(30.0, bins.number.max())
-    power = bins.square - 2.0 * best.slope * bins.product + best.slope**2 * bins.ramp
-    ratio = power[many] / (bins.number[many] * best.variance[many])
-    return _probability(bins.number[many], ratio, max(1, int(many.sum()) - int(np.sum(best.theta > 0.0))))
-
-
-def _probability(freedom: Array, ratio: Array, count: int) -> float:
-    """Return the p-value of the sum of squared normal scores of χ²/freedom ratios, with ``count`` degrees of freedom.
-
-    The cube root of a χ² variable is nearly normal (Wilson & Hilferty 1931); the tail of the Pearson statistic is too heavy at 1e-3.
-    """
-    from scipy.stats import chi2
-
-    spread = 2.0 / (9.0 * freedom)
-    score = (np.cbrt(ratio) - 1.0 + spread) / np.sqrt(spread)
-    return float(chi2.sf(score @ score, count))

@@ -76,7 +76,7 @@ def error_objective(
     The likelihood of the errors under the filter's covariance requires small errors.
     """
     base = likelihood(cases, filter_setup, free, threads=threads)
-    references = tuple(_spread(base, number) for number in range(len(base.cases)))
+    references = tuple(_reference(base, number) for number in range(len(base.cases)))
     if len({known.bias is None for known in references}) > 1:
         raise InputError(
             "some records have a true bias, others a reference attitude alone; tune on records of one kind"
@@ -95,16 +95,14 @@ class Reference(NamedTuple):
     bias: Array | None
     """Gyro bias (m, 3) if known, rad/s."""
 
-    def at(self, rows: slice) -> Reference:
-        """Return the selected rows."""
-        return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
 
-
-def reference(case: Case, edges: np.ndarray) -> Reference:
-    """Return the truth of a record at those of the given edges where it is known and used for tuning."""
-    time, truth = case.record.time[edges], case.record.truth
+def _reference(base: Likelihood, number: int) -> Reference:
+    """Return the truth of a record where it is used, at edges spaced by the correlation time of the attitude error."""
+    case = base.cases[number]
+    truth = case.record.truth
     attitude = case.true_attitude if truth is None else truth.attitude
-    judged = (time >= case.first) & (time <= case.last)
+    edges = np.arange(0, len(case.record.time), base.filter_setup.integration.samples)
+    judged = (case.record.time[edges] >= case.first) & (case.record.time[edges] <= case.last)
     if case.judged is not None:
         judged &= case.judged[edges]
     if attitude is not None:
@@ -114,21 +112,15 @@ def reference(case: Case, edges: np.ndarray) -> Reference:
             f"{case.name or 'record'} has no truth at the times to be judged; tune by the innovations instead (leave truth out), or give a "
             "reference"
         )
-    rows = edges[judged]
-    return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
-
-
-def _spread(base: Likelihood, number: int) -> Reference:
-    """Return the truth of a record at edges spaced by the correlation time of the attitude error at the starting point."""
-    case = base.cases[number]
-    known = reference(case, np.arange(0, len(case.record.time), base.filter_setup.integration.samples))
-    picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
-    m = len(picked.epochs)
-    if m < 100:
-        return picked
-    attitude, _, P = base.estimates(number, base.start[None], picked.epochs)
-    white = turns(attitude[:, 0], picked.attitude) / np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
-    lag = 1
-    while lag < m // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
-        lag += 1
-    return picked.at(slice(None, None, lag))
+    epochs = np.flatnonzero(judged)
+    epochs = epochs[:: max(1, len(epochs) // MAX_EPOCHS)]
+    m, lag = len(epochs), 1
+    if m >= 100:
+        estimated, _, P = base.estimates(number, base.start[None], epochs)
+        sigma = np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
+        white = turns(estimated[:, 0], attitude[edges[epochs]]) / sigma
+        while lag < m // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
+            lag += 1
+    epochs = epochs[::lag]
+    rows = edges[epochs]
+    return Reference(epochs, attitude[rows], None if truth is None else truth.bias[rows])

@@ -134,15 +134,15 @@ class Likelihood(Objective):
         rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
         return np.asarray(0.5 * (rows + rows.T))
 
-    def judged(self, point: Array) -> list[tuple[str, Array]]:
+    def outliers(self, point: Array) -> list[tuple[str, Array]]:
         """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
-        judged = []
+        by_sensor = []
         for case in self.prepared:
-            rows = self._pass(case, point[None], judged=True)["probability"]
+            rows = self._pass(case, point[None], outliers=True)["probability"]
             events = case.problem.events
             used = case.used[np.searchsorted(case.cuts, events.time, side="left")]
-            judged += [(name, rows[used & (events.sensor == k)]) for k, name in enumerate(events.sensors)]
-        return judged
+            by_sensor += [(name, rows[used & (events.sensor == k)]) for k, name in enumerate(events.sensors)]
+        return by_sensor
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), whole bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p).
@@ -266,7 +266,7 @@ class Likelihood(Objective):
         *,
         free: int = 0,
         epochs: np.ndarray | None = None,
-        judged: bool = False,
+        outliers: bool = False,
     ) -> dict[str, Array]:
         """Run up to eight points over one record; return the outputs by names of :class:`strapdown.kernels.likelihood.Outputs`."""
         body = self._body(case, points)
@@ -278,7 +278,7 @@ class Likelihood(Objective):
             "information": np.zeros((parts, free, free)),
             "x": np.empty((len(kept), body.filters.x.shape[1])),
             "P": np.empty((len(kept), body.filters.P.shape[1])),
-            "probability": np.empty((len(events.time) if judged else 0, 2)),
+            "probability": np.empty((len(events.time) if outliers else 0, 2)),
         }
         out = kernel.Outputs(**room | {"minus_log": room["minus_log"].reshape(-1)})
         bodies = (likelihood_outliers, kernel, case.kernels) if self.mixed else (kernel, case.kernels)

@@ -135,7 +135,7 @@ class _SensorNoise:
 def _noise_by_sensor(objective: Likelihood, point: Array) -> dict[str, _SensorNoise]:
     none = np.concatenate([point, [-np.inf, 0.0]])
     shares: dict[str, list[float]] = {}
-    for name, rows in objective.judged(none):
+    for name, rows in objective.outliers(none):
         shares.setdefault(name, []).extend(rows[:, 1])
     kinds = {series.sensor: KINDS[series.kind] for case in objective.cases for series in case.record.vectors}
     return {
