@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from strapdown import allan
-from strapdown.checks import InputError
 
 
 def gaps(samples: int, kind: str, seed: int = 0) -> np.ndarray:
@@ -152,24 +151,3 @@ def test_a_stretch_that_moves_is_seen():
     )
     assert 1e-6 < once < 0.1
     assert twice == pytest.approx(2.0 * once, rel=1e-6)
-
-
-GAPPY = np.append(np.arange(9.0) % 3, np.nan)
-
-
-@pytest.mark.parametrize(
-    ("call", "values", "options", "words"),
-    [
-        (allan.fit_noise, np.full(100, np.nan), {}, "at least 64 without a gap are needed"),
-        (allan.fit_noise, np.where(np.arange(500) % 50, 1.0, np.nan), {}, "at least 64 without a gap are needed"),
-        (allan.fit_noise, np.where(np.arange(500) == 250, np.nan, 1.0), {}, "axis 0, has no noise"),
-        *(
-            (allan.allan_deviation, GAPPY, {"confidence_level": level}, "confidence_level is ")
-            for level in (0.5, 1.0, np.nan)
-        ),
-        (allan.allan_deviation, GAPPY, {"taus": [6.0]}, "must be between"),
-    ],
-)
-def test_what_shows_nothing_is_refused(call, values, options, words):
-    with pytest.raises(InputError, match=words):
-        call(values, 1.0, **options)

@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import minimize
 
 from strapdown.allan import temperature as allan_temperature
-from strapdown.checks import InputError
 
 DT, N, K = 0.1, 1e-3, 2e-4
 
@@ -117,12 +116,3 @@ def test_an_interval_of_a_mixture_holds_its_draws():
     which = random.choice(2, 200_000, p=weights)
     held = np.mean(np.abs(centre[which] + sigma[which] * random.standard_normal(200_000)) <= reach)
     assert abs(held - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 200_000)
-
-
-@pytest.mark.parametrize(
-    ("temperature", "words"),
-    [(np.full(500, 20.0), "spans 0 K, less than 0.5 K"), (np.linspace(0, 9, 400), "temperature has shape")],
-)
-def test_what_shows_nothing_is_refused(temperature, words):
-    with pytest.raises(InputError, match=words):
-        allan_temperature.fit_temperature(np.random.default_rng(1).standard_normal(500), temperature, DT)

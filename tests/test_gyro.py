@@ -72,13 +72,6 @@ def test_rate_form_with_every_deterministic_term():
     np.testing.assert_allclose(output.bias, bias, rtol=1e-12, atol=1e-18)
 
 
-def test_missing_specific_force_or_temperature_is_refused():
-    with pytest.raises(InputError, match="specific_force"):
-        simulate(GyroSpec(g_sensitivity=np.eye(3)))
-    with pytest.raises(InputError, match="temperature"):
-        simulate(GyroSpec(temperature=warming(1.0)))
-
-
 def test_saturation_clips_the_rate_and_resolution_rounds_it():
     rates, edges = RNG.normal(size=(500, 3)), np.arange(501) * 0.02
     clipped = simulate(GyroSpec(range=0.9), rates * 0.02, edges)
@@ -146,8 +139,10 @@ def test_random_walks_have_the_exact_discrete_moments(steps):
             expected = white[axis] ** 2 * h + walk[axis] ** 2 * h**3 / 12.0
             assert within(np.mean(rest[own, axis] ** 2), expected, n)
         if len(steps) == 1:
-            for other in (rest[:, axis], change[:, (axis + 1) % 3], np.roll(change[:, axis], 1)):
-                assert abs(np.corrcoef(change[:, axis], other)[0, 1]) * math.sqrt(n) < 4.5
+            pairs = [(change[:, axis], rest[:, axis]), (change[:, axis], change[:, (axis + 1) % 3])]
+            pairs += [(x[:, axis], np.roll(x[:, axis], lag)) for x in (change, rest) for lag in (1, 2, 3)]
+            for first, second in pairs:
+                assert abs(np.corrcoef(first, second)[0, 1]) * math.sqrt(n) < 4.5
 
 
 @pytest.mark.parametrize("u", [1e-9, 1e-4, 0.0199, 0.0201, 0.3, 3.0, 40.0])
@@ -257,16 +252,6 @@ def check_spectrum(series, covariance):
 
 def records(spec, samples, runs, what):
     return np.concatenate([what(simulate(spec, samples=samples, dt=1.0, run=k)) for k in range(runs)], axis=1)
-
-
-def test_spectrum_of_white_noise():
-    series = records(GyroSpec(angle_random_walk=0.5), 1024, 60, lambda o: o.rates)
-    check_spectrum(series, np.r_[0.25, np.zeros(1023)])
-
-
-def test_spectrum_of_rate_random_walk():
-    series = records(GyroSpec(rate_random_walk=0.5), 1025, 60, lambda o: np.diff(o.rates, axis=0))
-    check_spectrum(series, 0.25 * np.r_[2.0 / 3.0, 1.0 / 6.0, np.zeros(1022)])
 
 
 def test_spectrum_of_quantisation():
@@ -391,21 +376,6 @@ def test_low_pass_white_noise_is_stationary_and_keeps_the_random_walk_of_the_ang
 # ---------------------------------------------------------------------------------------------------- specification and tables
 
 
-def test_wrong_fields_are_refused_by_name():
-    for field, value in (
-        ("angle_random_walk", -1.0),
-        ("bias_instability", [1.0, -1.0, 0.0]),
-        ("misalignment", np.eye(3)),
-        ("bandwidth", 0.0),
-        ("drop_probability", 1.0),
-        ("scale_factor", [1.0]),
-        ("markov_correlation_time", -3.0),
-        ("timestamp_offset", np.nan),
-    ):
-        with pytest.raises(InputError, match=field):
-            GyroSpec(**{field: value})
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(1e-12, 1e3), min_size=8, max_size=8), st.booleans())
 def test_a_table_holds_the_specification_to_the_last_bit(values, by_axis):
@@ -429,16 +399,10 @@ def test_a_table_holds_the_specification_to_the_last_bit(values, by_axis):
     assert gyro.from_table(gyro.to_table(spec)) != dataclasses.replace(spec, damping=0.123)
 
 
-def test_tables_are_readable_and_refuse_unknown_keys():
+def test_tables_are_readable():
     spec = gyro.from_table({"angle_random_walk_deg_per_sqrt_hour": 0.15, "scale_factor_ppm": [500.0, 0.0, 0.0]})
     assert spec.angle_random_walk == 0.15 * math.pi / 10800.0
     assert gyro.to_table(spec)["angle_random_walk_deg_per_sqrt_hour"] == 0.15
-    with pytest.raises(InputError, match="did you mean 'bandwidth_hz'"):
-        gyro.from_table({"bandwith_hz": 3.0})
-    with pytest.raises(InputError, match="second time"):
-        gyro.from_table({"range_deg_per_s": 3.0, "range_rad_per_s": 3.0})
-    with pytest.raises(InputError, match="unit is in the key"):
-        gyro.from_table({"range_deg_per_s": "3 deg/s"})
 
 
 # ----------------------------------------------------------------------------------------------------------------- data sheets
@@ -469,25 +433,38 @@ def test_units_convert(name, unit, factor):
         assert value == pytest.approx(number * factor, rel=4e-16)
 
 
-@pytest.mark.parametrize(
-    ("given_as", "message"),
-    [
-        ({"arw": "0.15 deg/h"}, r"arw is '0.15 deg/h' \(in radian / second\).*deg/sqrt\(h\)"),
-        ({"bias_instability": "0.5 deg/sqrt(h)"}, "bias_instability.*deg/h"),
-        ({"rrw": "0.5 deg/sqrt(h)"}, "rrw.*deg/h/sqrt"),
-        ({"arw": "0.15"}, "no unit"),
-        ({"arw": "0.15 1/sqrt(h)"}, "radian / second"),
-        ({"arw": "0.15 bananas"}, "bananas"),
-        ({"arw": "deg//h"}, "not a quantity"),
-        ({"arw": 0.15}, r"as text with its unit, such as deg/sqrt\(h\) or deg/s/sqrt\(Hz\)$"),
-        ({"bandwidth": "50 rad/s"}, "bandwidth.*Hz"),
-        ({"awr": "1 deg/h"}, "did you mean 'arw'"),
-        ({"quantization": "1 arcsec", "angle_resolution": "1 arcsec"}, "the same quantity"),
-    ],
-)
-def test_wrong_units_are_refused_by_name(given_as, message):
+SHEET = datasheets.from_datasheet
+# fmt: off
+REFUSED = [
+    *((GyroSpec, {field: value}, field) for field, value in (
+        ("angle_random_walk", -1.0), ("bias_instability", [1.0, -1.0, 0.0]), ("misalignment", np.eye(3)), ("bandwidth", 0.0),
+        ("drop_probability", 1.0), ("scale_factor", [1.0]), ("markov_correlation_time", -3.0), ("timestamp_offset", np.nan),
+    )),
+    (gyro.from_table, {"table": {"bandwith_hz": 3.0}}, "did you mean 'bandwidth_hz'"),
+    (gyro.from_table, {"table": {"range_deg_per_s": 3.0, "range_rad_per_s": 3.0}}, "second time"),
+    (gyro.from_table, {"table": {"range_deg_per_s": "3 deg/s"}}, "unit is in the key"),
+    (simulate, {"spec": GyroSpec(g_sensitivity=np.eye(3))}, "specific_force"),
+    (simulate, {"spec": GyroSpec(temperature=warming(1.0))}, "temperature"),
+    (gyro.process_noise, {"spec": GyroSpec(bias_instability=1.0)}, "bandwidth"),
+    (SHEET, {"arw": "0.15 deg/h"}, r"arw is '0.15 deg/h' \(in radian / second\).*deg/sqrt\(h\)"),
+    (SHEET, {"bias_instability": "0.5 deg/sqrt(h)"}, "bias_instability.*deg/h"),
+    (SHEET, {"rrw": "0.5 deg/sqrt(h)"}, "rrw.*deg/h/sqrt"),
+    (SHEET, {"arw": "0.15"}, "no unit"),
+    (SHEET, {"arw": "0.15 1/sqrt(h)"}, "radian / second"),
+    (SHEET, {"arw": "0.15 bananas"}, "bananas"),
+    (SHEET, {"arw": "deg//h"}, "not a quantity"),
+    (SHEET, {"arw": 0.15}, r"as text with its unit, such as deg/sqrt\(h\) or deg/s/sqrt\(Hz\)$"),
+    (SHEET, {"bandwidth": "50 rad/s"}, "bandwidth.*Hz"),
+    (SHEET, {"awr": "1 deg/h"}, "did you mean 'arw'"),
+    (SHEET, {"quantization": "1 arcsec", "angle_resolution": "1 arcsec"}, "the same quantity"),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("call", "arguments", "message"), REFUSED, ids=[row[2] for row in REFUSED])
+def test_what_makes_no_sense_is_refused_by_name(call, arguments, message):
     with pytest.raises(InputError, match=message):
-        datasheets.from_datasheet(**given_as)
+        call(**arguments)
 
 
 def test_sheet_figures_reach_their_fields():
@@ -566,8 +543,6 @@ def test_presets_go_from_consumer_to_navigation_grade():
 def test_process_noise_without_flicker_is_the_gyro_s_own():
     spec = GyroSpec(angle_random_walk=[1.0, 2.0, 3.0], rate_random_walk=3.0, markov_noise=4.0)
     assert gyro.process_noise(spec) == {"angle_random_walk": 3.0, "rate_random_walk": 5.0}
-    with pytest.raises(InputError, match="bandwidth"):
-        gyro.process_noise(GyroSpec(bias_instability=1.0))
 
 
 @pytest.mark.parametrize("corner", [1e-3, 1.0, 30.0])
