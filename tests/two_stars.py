@@ -10,7 +10,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo.scalar import start
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import Estimate, ImuRecord, Truth
 
 ARW, RRW = 1e-4, 3e-6
 SIGMAS = (1e-4, 2e-4)
@@ -102,6 +102,12 @@ def angle_case(n: int, *, struck: float = 0.0) -> tuple[tuning.Case, np.ndarray,
     )
     record = ImuRecord(time=time, increments=increments, vectors=(series,))
     return tuning.Case(record=record, initial=setup.initial_state(ANGLES, quaternion.IDENTITY)), increments, angles
+
+
+def minus_log(estimate: Estimate) -> float:
+    """Return minus the log likelihood, without its constant, of the innovations of an ordinary run of the filter."""
+    series = estimate.innovations.values()
+    return float(0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in series))
 
 
 def differences(value: Any, point: np.ndarray, step: float = 1e-3) -> np.ndarray:
