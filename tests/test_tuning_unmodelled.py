@@ -58,7 +58,7 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
         assert json.dumps(unmodelled.summary())
-        assert size.finding.p_value == pytest.approx(3.0 * chi2.sf(size.gain, 3), rel=1e-9)  # of three levels
+        assert size.finding.p_value == pytest.approx(chi2.sf(size.gain, 3), rel=1e-9)
     assert doubted >= 1  # where the walk is called identified it is put in doubt
     # A cause that explains more goes first.
     cause = dataclasses.replace(size, name="hard iron", of="star 1", gain=size.gain + 1.0)
@@ -78,7 +78,7 @@ def test_of_right_filters_hardly_one_is_suspected():
             assert unmodelled.words == ()
             assert examined.parameters == result.parameters
     assert suspected <= 1
-    assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
+    assert np.mean(gains) < 6.0  # χ² of three degrees of freedom
 
 
 def test_measurements_with_a_sigma_for_each_axis_are_not_examined():

@@ -2,14 +2,13 @@
 
 Tuning gives every parameter its most likely value even if the model is wrong. A gyro's scale-factor error changes its apparent bias with
 the rate, so the random walk of the bias is tuned large enough to cover that; it appears identified, and the innovations appear white. The
-test is then whether a scale factor explains the innovations better: the hypothesis of :mod:`strapdown.tuning.diagnosis`, with the tuned
-random walk and with smaller ones, which a filter that models the scale factor would have. Its gain is twice the log-likelihood ratio to the
-tuned filter, χ² with three degrees of freedom if the scale factor is zero.
+test is then whether a scale factor explains the innovations better: the hypothesis of :mod:`strapdown.tuning.diagnosis`. Its gain is twice
+the log-likelihood ratio to the tuned filter, χ² with three degrees of freedom if the scale factor is zero. (With a smaller random walk, as
+of a filter that models the scale factor, the gain is up to twice as large, but it is found in the same records.)
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,7 +27,7 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.tuning import diagnosis
 from strapdown.tuning.diagnosis import Cause
-from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, PLAUSIBLE, gyro_error, shown, turns
+from strapdown.tuning.diagnosis.hypotheses import PLAUSIBLE, gyro_errors, shown, turns
 from strapdown.tuning.diagnosis.likelihood import Model, by_mean, log_p, run
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
@@ -38,8 +37,6 @@ from strapdown.vectors import VectorMeasurements
 
 PROBABILITY = 0.99
 """Probability that a filter that models all errors passes all tests."""
-LEVELS = (1.0, 0.2, 0.04)
-"""Multiples of the tuned random walk of the bias with which a scale factor is tested."""
 MAX_REPORTED = 2
 """Maximum number of failed tests that are reported individually."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
@@ -55,7 +52,7 @@ class Unmodelled:
     judgement: Judgement
     """Judgement of the tuned filter on its tuning data; of its errors too if there is a truth."""
     scale_factor: Cause
-    """A gyro's scale factor as an explanation of what the filter models as noise; its p-value is over all levels tested."""
+    """A gyro's scale factor as an explanation of what the filter models as noise."""
     causes: tuple[Cause, ...] = ()
     """Likely causes, if a test in :data:`SHAPES` fails."""
     missing: tuple[str, ...] = ()
@@ -196,17 +193,8 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 
 
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Cause:
-    """Return the gyro's scale factor of largest gain, with this noise or a smaller random walk of the bias."""
-    hypothesis = gyro_error(turns(record, noise, initial), *GYRO_ERRORS[0])
-    levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
-    tuned = run(Model(record=record, noise=noise, initial=initial))
-    causes = []
-    for level in levels:
-        less = replace(noise, rate_random_walk=level * noise.rate_random_walk)
-        model = Model(record=record, noise=less, initial=initial)
-        base = run(model)
-        cause = by_mean(model, base, hypothesis)
-        # The gain of a smaller random walk alone, if it was not tuned, is not due to the scale factor.
-        gain = cause.gain + min(base.gain_over(tuned), 0.0) - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))
-        causes.append(replace(cause, gain=gain, log_p=min(0.0, log_p(gain, 3) + math.log(len(levels)))))
-    return max(causes, key=lambda cause: cause.gain)
+    """Return the gyro's scale factor as an explanation of the innovations of a filter."""
+    model = Model(record=record, noise=noise, initial=initial)
+    cause = by_mean(model, run(model), gyro_errors(turns(record, noise, initial))[0])
+    gain = cause.gain - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))
+    return replace(cause, gain=gain, log_p=log_p(gain, 3))

@@ -45,8 +45,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
             yield _reference_direction(series)
     if len(measured) > 1:
         yield _time_offset("gyro", tuple(series.sensor for series in measured), interval)
-    turned = turns(record, model.noise, model.initial)
-    yield from (gyro_error(turned, *kind) for kind in GYRO_ERRORS)
+    yield from gyro_errors(turns(record, model.noise, model.initial))
     sigma = np.sqrt(np.diag(model.initial.covariance))
     yield _initial("attitude", "rad", sigma[:3])
     yield _initial("bias", "rad/s", sigma[3:6])
@@ -177,53 +176,54 @@ def _reference_direction(series: VectorMeasurements) -> Hypothesis:
     return _of_series(series.sensor, "reference direction", "rad", 3, 0.35, change, words)
 
 
-def _off_diagonal(theta: Array) -> Array:
-    matrix = np.zeros((3, 3))
-    matrix[~np.eye(3, dtype=bool)] = theta
-    return matrix
+def gyro_errors(turned: Array) -> list[Hypothesis]:
+    """Return the hypotheses of errors M of a gyro that measures (I + M) w; ``turned`` are the rotations on which they act."""
 
+    def error(
+        name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
+    ) -> Hypothesis:
+        def apply(model: Model, theta: Array) -> Model:
+            # Increments times (I + M)⁻¹ would also change their noise and bias.
+            excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
+            return model.with_increments(model.record.increments - excess)
 
-GYRO_ERRORS: tuple[tuple[str, str, int, Callable[[Array], Array], Callable[[Array], str]], ...] = (
-    ("scale factor", "1", 3, np.diag, lambda theta: f"the gyro's scale factor is in error by {shown(theta, 1e6)} ppm"),
-    (
-        "mounting",
-        "rad",
-        3,
+        return Hypothesis(
+            name=name,
+            of="gyro",
+            unit=unit,
+            steps=np.full(size, 1e-5),
+            limit=0.2,
+            plausible=PLAUSIBLE,
+            apply=apply,
+            words=lambda theta, _: f"the gyro{words(theta)}",
+        )
+
+    def off_diagonal(theta: Array) -> Array:
+        matrix = np.zeros((3, 3))
+        matrix[~np.eye(3, dtype=bool)] = theta
+        return matrix
+
+    def turned_back(theta: Array) -> Array:
         # In axes rotated by θ the measured rate is rotated by −θ.
-        lambda theta: quaternion.to_matrix(quaternion.exp(-theta)) - np.eye(3),
-        lambda theta: f"the gyro has a mounting error of {shown(theta, 1e3)} mrad in the body",
-    ),
-    (
-        "misalignment",
-        "rad",
-        6,
-        _off_diagonal,
-        lambda theta: f"the gyro's axes are misaligned, xy, xz, yx, yz, zx, zy by {shown(theta, 1e3)} mrad",
-    ),
-)
-"""Errors M of a gyro that measures (I + M) w: name, unit, dimension of θ, M(θ), and description."""
+        return quaternion.to_matrix(quaternion.exp(-theta)) - np.eye(3)
 
-
-def gyro_error(
-    turned: Array, name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
-) -> Hypothesis:
-    """Return the hypothesis of an error of :data:`GYRO_ERRORS`; ``turned`` are the rotations on which it acts."""
-
-    def apply(model: Model, theta: Array) -> Model:
-        # Increments times (I + M)⁻¹ would also change their noise and bias.
-        excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
-        return model.with_increments(model.record.increments - excess)
-
-    return Hypothesis(
-        name=name,
-        of="gyro",
-        unit=unit,
-        steps=np.full(size, 1e-5),
-        limit=0.2,
-        plausible=PLAUSIBLE,
-        apply=apply,
-        words=lambda theta, _: words(theta),
-    )
+    return [
+        error("scale factor", "1", 3, np.diag, lambda theta: f"'s scale factor is in error by {shown(theta, 1e6)} ppm"),
+        error(
+            "mounting",
+            "rad",
+            3,
+            turned_back,
+            lambda theta: f" has a mounting error of {shown(theta, 1e3)} mrad in the body",
+        ),
+        error(
+            "misalignment",
+            "rad",
+            6,
+            off_diagonal,
+            lambda theta: f"'s axes are misaligned, xy, xz, yx, yz, zx, zy by {shown(theta, 1e3)} mrad",
+        ),
+    ]
 
 
 def turns(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Array:
