@@ -352,7 +352,7 @@ def test_low_pass_frequency_response(frequency):
 def test_low_pass_noise_by_an_independent_integral(x):
     damping, dt = 0.7, 0.5
     natural = x / dt
-    _, factor = gyro.model.low_pass_step(natural, damping, dt)
+    _, factor = gyro.simulation.low_pass_step(natural, damping, dt)
     A = np.array([[0.0, 1.0, 0.0], [-(natural**2), -2.0 * damping * natural, 0.0], [1.0, 0.0, 0.0]])
     nodes, weights = np.polynomial.legendre.leggauss(120)
     responses = [linalg.expm(A * (0.5 * dt * (1.0 + node))) @ [0.0, natural**2, 0.0] for node in nodes]
@@ -516,7 +516,7 @@ STATED = {
 
 @pytest.mark.parametrize("name", datasheets.PRESETS)
 def test_the_stated_figures_of_a_preset_are_those_of_its_sheet(name):
-    sheet, stated = datasheets.from_datasheet(**STATED[name]), gyro.model.from_table(datasheets.PRESETS[name].stated)
+    sheet, stated = datasheets.from_datasheet(**STATED[name]), gyro.from_table(datasheets.PRESETS[name].stated)
     for field, value in vars(sheet).items():
         if isinstance(value, (float, np.ndarray)):
             np.testing.assert_allclose(getattr(stated, field), value, rtol=1e-14, err_msg=field)
@@ -563,7 +563,9 @@ def test_flicker_share_by_quadrature(damping):
     with mp.workdps(30):
         z = mp.mpf(damping)
         integral = mp.quad(lambda v: 1 / ((1 - v) ** 2 + 4 * z * z * v), [0, 0.5, 0.9, 1, 1.1, 2, 10, 1e3, 1e6, mp.inf])
-        assert gyro.model.flicker_share(damping) == pytest.approx(float(integral / (2 * mp.pi) * 4 * z), rel=1e-8)
+        assert gyro.filter_noise.flicker_share(damping) == pytest.approx(
+            float(integral / (2 * mp.pi) * 4 * z), rel=1e-8
+        )
 
 
 @pytest.mark.parametrize("white", [1e-3, 0.3, 10.0])

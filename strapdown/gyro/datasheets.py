@@ -54,14 +54,9 @@ def parse(name: str, text: str, wanted: str, example: str) -> float:
     registry = _registry()
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example}")
-    plain = (
-        text.replace("°", " deg")
-        .replace("√Hz", "sqrt(Hz)")
-        .replace("√h", "sqrt(h)")
-        .replace("√s", "sqrt(s)")
-        .replace("″", " arcsec")
-    )
-    plain = re.sub(r"\bHz\b", "(1/second)", re.sub(r"\bhr?\b", "hour", re.sub(r"\bg\b", "standard_gravity", plain)))
+    plain = re.sub(r"√(\w+)", r"sqrt(\1)", text.replace("°", " deg").replace("″", " arcsec"))
+    for symbol, unit in ((r"\bg\b", "standard_gravity"), (r"\bhr?\b", "hour"), (r"\bHz\b", "(1/second)")):
+        plain = re.sub(symbol, unit, plain)
     plain = re.sub(r"sqrt\(((?:[^()]|\([^()]*\))*)\)", r"((\1) ** 0.5)", plain)
     try:
         quantity = registry.Quantity(plain)

@@ -180,7 +180,7 @@ def gyro_errors(turned: Array) -> list[Hypothesis]:
     """Return the hypotheses of errors M of a gyro that measures (I + M) w; ``turned`` are the rotations on which they act."""
 
     def error(
-        name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
+        name: str, unit: str, size: int, matrix: Callable[[Array], Array], factor: float, words: str
     ) -> Hypothesis:
         def apply(model: Model, theta: Array) -> Model:
             # Increments times (I + M)⁻¹ would also change their noise and bias.
@@ -195,7 +195,7 @@ def gyro_errors(turned: Array) -> list[Hypothesis]:
             limit=0.2,
             plausible=PLAUSIBLE,
             apply=apply,
-            words=lambda theta, _: f"the gyro{words(theta)}",
+            words=lambda theta, _: words.format(shown(theta, factor)),
         )
 
     def off_diagonal(theta: Array) -> Array:
@@ -208,20 +208,15 @@ def gyro_errors(turned: Array) -> list[Hypothesis]:
         return quaternion.to_matrix(quaternion.exp(-theta)) - np.eye(3)
 
     return [
-        error("scale factor", "1", 3, np.diag, lambda theta: f"'s scale factor is in error by {shown(theta, 1e6)} ppm"),
-        error(
-            "mounting",
-            "rad",
-            3,
-            turned_back,
-            lambda theta: f" has a mounting error of {shown(theta, 1e3)} mrad in the body",
-        ),
+        error("scale factor", "1", 3, np.diag, 1e6, "the gyro's scale factor is in error by {} ppm"),
+        error("mounting", "rad", 3, turned_back, 1e3, "the gyro has a mounting error of {} mrad in the body"),
         error(
             "misalignment",
             "rad",
             6,
             off_diagonal,
-            lambda theta: f"'s axes are misaligned, xy, xz, yx, yz, zx, zy by {shown(theta, 1e3)} mrad",
+            1e3,
+            "the gyro's axes are misaligned, xy, xz, yx, yz, zx, zy by {} mrad",
         ),
     ]
 
