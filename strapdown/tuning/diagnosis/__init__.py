@@ -11,14 +11,13 @@ cause that merely resembles the true one explains less. If two explain the same 
 Commutation error is the exception: in the innovations it *is* a gyro bias, which the filter estimates. It is computed from the increments
 by a more accurate integration algorithm, and compared with the filter's σ of the bias, and with the truth if there is one.
 
-- ``diagnosing``: :func:`diagnose`.
+- ``diagnosing``: :func:`diagnose`, and commutation.
 - ``causes``: The result, :class:`Diagnosis`.
-- ``hypotheses``, ``commutation``: Possible faults.
+- ``hypotheses``: Possible faults.
 - ``likelihood``: The likelihood of the record under a hypothesis.
 """
 
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
-from strapdown.tuning.diagnosis.commutation import commutation_drift
-from strapdown.tuning.diagnosis.diagnosing import diagnose
+from strapdown.tuning.diagnosis.diagnosing import commutation_drift, diagnose
 
 __all__ = ["Cause", "Diagnosis", "diagnose"]

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from strapdown import coning, consistency, estimation
-from strapdown.checks import InputError
+from strapdown import coning, consistency, estimation, quaternion
+from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
-from strapdown.tuning.diagnosis.commutation import ACCURATE_ALGORITHM, commutation
-from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
-from strapdown.tuning.diagnosis.likelihood import Model, Run, by_mean, by_variance, run
+from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers, shown
+from strapdown.tuning.diagnosis.likelihood import Model, Run, by_mean, by_variance, log_p, run
+from strapdown.units import DEGREE_PER_HOUR
 
+ACCURATE_ALGORITHM = "matched-1-8-8"
+"""Integration algorithm with which others are compared."""
 GROSS = 3.0
 """Conventions are tested if the NIS per degree of freedom of a sensor exceeds this, because a wrong one has a large effect."""
 
@@ -71,7 +75,7 @@ def diagnose(
     base = run(model)
     accurate = modelled_record(record, replace(setup, integration=coning.ALGORITHMS[ACCURATE_ALGORITHM]))
     better = run(replace(model, record=replace(accurate, truth=None))).closer_than(base)
-    considered = [*_causes(model, base, estimate), commutation(record, setup, estimate, kept, better)]
+    considered = [*_causes(model, base, estimate), _commutation(record, setup, estimate, kept, better)]
     worst = max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in estimate.innovations.values() if len(i.time))
     if worst > GROSS:
         considered += conventions(model, base)
@@ -103,3 +107,60 @@ def _causes(model: Model, base: Run, estimate: Estimate) -> Iterator[Cause]:
     for sensor, innovations in estimate.innovations.items():
         if len(innovations.time):
             yield outliers(sensor, innovations.whitened)
+
+
+def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[Array, Array]:
+    """Return the mean drift of an algorithm's attitude on a record, estimated minus true (3,), rad/s, body axes, and its standard error.
+
+    The increments are integrated by the algorithm and by a more accurate one, and the rotations of each step compared. A filter estimates
+    this drift as gyro bias, in addition to the true one.
+    """
+    n = algorithm.samples
+    blocks = len(record.increments) // n
+    if blocks < 2:
+        raise InputError(f"record has {len(record.increments)} gyro samples, too few for {algorithm.name}")
+    increments = record.increments[: blocks * n]
+    edges = record.time[: blocks * n + 1]
+    own = quaternion.exp(coning.rotation_vectors(increments, algorithm, edges=edges))
+    best = quaternion.exp(coning.rotation_vectors(increments, ACCURATE_ALGORITHM, edges=edges)).reshape(blocks, n, 4)
+    turn = best[:, 0]
+    for k in range(1, n):
+        turn = quaternion.multiply(turn, best[:, k])
+    step = np.diff(record.time[: blocks * n + 1 : n])
+    drift = quaternion.log(quaternion.multiply(quaternion.conjugate(turn), own))
+    # Steps of one vibration are correlated, so the scatter is that between blocks much longer than its period.
+    parts = min(20, blocks)
+    bounds = np.linspace(0, blocks, parts + 1).astype(int)
+    means = np.array([drift[a:b].sum(axis=0) / step[a:b].sum() for a, b in itertools.pairwise(bounds)])
+    return drift.sum(axis=0) / step.sum(), means.std(axis=0, ddof=1) / math.sqrt(parts)
+
+
+def _commutation(
+    record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth: Truth | None, better: float
+) -> Cause:
+    """Return commutation as a cause; its gain is by the bias error that it explains at the end, or would without a truth.
+
+    Or it is ``better``, that of the innovations with the accurate algorithm, which has no parameter: its p-value is at most exp(−gain/2).
+    """
+    drift, error = commutation_drift(record, setup.integration)
+    assert estimate.covariance is not None
+    P = estimate.covariance[-1, 3:, 3:] + np.diag(error**2)
+    # If the drift is estimated as bias, b_true − b_est is −drift: the gain is by how well this explains the final error.
+    error_at_end = -drift if truth is None else truth.bias[-1] - estimate.bias[-1]
+    left = error_at_end + drift
+    gain = float(error_at_end @ np.linalg.solve(P, error_at_end) - left @ np.linalg.solve(P, left))
+    size = float(np.linalg.norm(drift))
+    sigma = math.sqrt(float(drift @ P @ drift)) / size if size > 0.0 else math.inf
+    return Cause(
+        name="commutation",
+        of=setup.integration.name,
+        estimate=drift,
+        standard_error=error,
+        unit="rad/s",
+        gain=max(gain, better),
+        log_p=min(log_p(gain, 1), -0.5 * better),
+        words=(
+            f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h on average, estimated as gyro bias; "
+            f"the filter's σ in this direction is {sigma / DEGREE_PER_HOUR:.3g} °/h"
+        ),
+    )
