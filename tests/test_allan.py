@@ -686,6 +686,7 @@ def test_table_and_parameters():
 
 
 RECORD = np.random.default_rng(0).standard_normal(200)
+WHITE_ALONE = allan.fit_noise(RECORD, 1.0, terms=["angle_random_walk"])
 GAPPY = np.append(np.arange(9.0) % 3, np.nan)
 
 
@@ -722,6 +723,12 @@ GAPPY = np.append(np.arange(9.0) % 3, np.nan)
         (lambda: allan.allan_deviation(GAPPY, 1.0, confidence_level=np.nan), "confidence_level is "),
         (lambda: allan.allan_deviation(GAPPY, 1.0, taus=[6.0]), "must be between"),
         (lambda: allan.temperature.fit_temperature(RECORD, np.full(200, 20.0), 1.0), "spans 0 K, less than 0.5 K"),
+        (lambda: allan.temperature.fit_temperature(np.full(100, 0.1), np.arange(100.0), 1.0), "axis 0, has no noise"),
+        (
+            lambda: allan.temperature.fit_temperature(RECORD[:5], np.arange(5.0), 1.0),
+            "values has 5 samples; at least 64",
+        ),
+        (lambda: allan.parameters.to_matlab({"gyro": WHITE_ALONE}), "the fit has no bias_instability"),
         (lambda: allan.temperature.fit_temperature(RECORD, np.linspace(0, 9, 100), 1.0), "temperature has shape"),
     ],
 )

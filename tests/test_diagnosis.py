@@ -303,10 +303,12 @@ def test_the_summary_is_plain():
     assert len(explanation.considered) > len(explanation.causes)
 
 
-def test_a_record_without_measurements_is_refused():
-    record = replace(scenarios.simulate(scenario(), seed=0), vectors=())
-    with pytest.raises(InputError, match="no vector measurements"):
-        diagnosis.diagnose(record, RIGHT, start(record, RIGHT, 0, 0))
+def test_a_record_without_measurements_in_its_time_is_refused():
+    record = scenarios.simulate(scenario(duration=5.0), seed=0)
+    initial = start(record, RIGHT, 0, 0)
+    for changed in (replace(record, vectors=()), late(1e6, "star", "magnetometer")(record)):
+        with pytest.raises(InputError, match="no vector measurements"):
+            diagnosis.diagnose(changed, RIGHT, initial)
 
 
 def test_missing_and_outlying_measurements_do_not_disturb():

@@ -68,6 +68,7 @@ TABLE = [
     (tuning.values_of, (BELIEVED, ["star 1.sigma"], [SILENT]), {}, "sigma is 0"),
     (tuning.Prior, (), {"value": 1.0, "factor": 1.0}, "factor of the prior is 1.0; .* greater than 1"),
     (tuning.fit, (free(*FREE),), {"priors": UNSPECIFIED}, "priors"),
+    (tuning.compare, ([replace(ONE, first=19.9, last=19.95)], BELIEVED, BELIEVED), {}, "no measurement between 19.9 and 19.95 s"),
     (setup.modelled_record, (HELD.record, AXES), {}, "mag is .*three numbers, but a heading has one degree of freedom"),
     (of_compass, ("acc.correlated_time",), {"filter_setup": COLOURED}, "did you mean 'acc.correlation_time'"),
     (of_compass, ("acd.bias_sigma",), {"filter_setup": OF_ANOTHER}, "did you mean 'acc'"),

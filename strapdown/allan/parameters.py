@@ -121,11 +121,16 @@ def commented(lines: list[str]) -> str:
     return "".join(f"# {_plain(line)}\n" for line in lines)
 
 
-def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
-    """Return the maximum coefficient of a term over the axes, SI, and True, or if no axis supports it the maximum upper end and False."""
+def _index(fit: NoiseFit, term: str) -> int:
+    """Return the place of a term in a fit."""
     if term not in fit.terms:
         raise InputError(f"the fit has no {term}; add it to the terms of the fit")
-    i = fit.terms.index(term)
+    return fit.terms.index(term)
+
+
+def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
+    """Return the maximum coefficient of a term over the axes, SI, and True, or if no axis supports it the maximum upper end and False."""
+    i = _index(fit, term)
     supported = fit.supported[:, i]
     if supported.any():
         return float(fit.estimate[supported, i].max()), True
@@ -142,7 +147,7 @@ def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
     """
     from scipy.special import ndtri
 
-    i = fit.terms.index(term)
+    i = _index(fit, term)
     tail = 1.0 - fit.confidence_level
     below = min(1.0 - fit.confidence_level ** (1.0 / len(fit.estimate)), 0.5 * tail)
     usual, supported = ndtri(0.5 * tail), fit.supported[:, i]
@@ -267,7 +272,7 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
             ("bias_instability", "BiasInstability"),
             ("rate_random_walk", "RandomWalk"),
         ):
-            column = np.resize(values[:, fit.terms.index(term)], 3)
+            column = np.resize(values[:, _index(fit, term)], 3)
             arguments.append(f"'{word}', [{' '.join(f'{x:.6e}' for x in column)}]")
         joined = ", ...\n    ".join(arguments)
         lines.append(f"imu.{name} = {make}({joined});")

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
 from strapdown.allan.deviation import TERMS
+from strapdown.allan.noise_fit import SHORTEST
 from strapdown.allan.spectrum import bin_starts, mean_power, scored
 from strapdown.checks import Array, Hint, InputError
 from strapdown.gyro.temperature import BiasOverTemperature, to_table
@@ -98,11 +99,13 @@ def fit_temperature(
     Raises
     ------
     InputError
-        If the temperature spans less than 0.5 K, or samples are missing.
+        If the temperature spans less than 0.5 K, or samples are missing, too few or constant.
     """
     x = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
     x = x[:, None] if x.ndim == 1 else x
     dt = checks.positive("sample_interval", sample_interval, unit="s")
+    if len(x) < SHORTEST:
+        raise InputError(f"values has {len(x)} samples; at least {SHORTEST} are needed to separate the noise terms")
     T = checks.array("temperature", temperature, (len(x),))
     checks.count("order", order)
     span = (float(T.min()), float(T.max()))
@@ -115,6 +118,8 @@ def fit_temperature(
     coefficients, sigma, reach = np.zeros((3, order + 1, x.shape[1]))
     left = np.empty_like(x)
     for axis in range(x.shape[1]):
+        if np.ptp(x[:, axis]) <= 1e-13 * np.abs(x[:, axis]).max():
+            raise InputError(f"values, axis {axis}, has no noise (it is constant); pass a recorded sensor")
         slopes, sigma[1:, axis], reach[1:, axis] = _regression(x[:, axis], powers, dt)
         left[:, axis] = x[:, axis] - np.sum((powers - powers.mean(axis=0)) * slopes, axis=1)
         coefficients[:, axis] = float(np.mean(x[:, axis]) - powers.mean(axis=0) @ slopes), *slopes

@@ -241,17 +241,22 @@ def _check_case(case: Case, filter_setup: FilterSetup) -> None:
     what = case.name or "record"
     for sensor in () if filter_setup.states is None else filter_setup.states.sensors:
         one_of(f"{what}: sensor of the states", sensor, [series.sensor for series in case.record.vectors])
-    first, last = case.span
-    if not any(
-        np.any(_usable(series) & (series.time >= first) & (series.time <= last)) for series in case.record.vectors
-    ):
-        raise InputError(
-            f"{what} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
-        )
+    need_measurements(case)
     if not isinstance(case.initial, State):
         raise InputError(
             f"{what}: initial is {case.initial!r}; it must be an estimation.State, which holds the whole bias"
         )
+
+
+def need_measurements(case: Case) -> None:
+    """Refuse a case without measurements in its time."""
+    first, last = case.span
+    for series in case.record.vectors:
+        if np.any(_usable(series) & (series.time >= first) & (series.time <= last)):
+            return
+    raise InputError(
+        f"{case.name or 'record'} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
+    )
 
 
 def _usable(series: VectorMeasurements) -> np.ndarray:

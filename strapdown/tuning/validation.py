@@ -18,7 +18,7 @@ from strapdown.estimation.schedule import selected
 from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, Truth
 from strapdown.results import Column, Listed, Table, figure
-from strapdown.tuning.objective import Case, of_sensors
+from strapdown.tuning.objective import Case, need_measurements, of_sensors
 from strapdown.units import DEGREE
 
 MAX_ROWS = 20_000
@@ -47,6 +47,7 @@ def split(cases: Sequence[Case], share: float) -> tuple[tuple[Case, ...], tuple[
         border = float(last - share * (last - first))
         train.append(replace(case, last=border))
         test.append(replace(case, first=float(np.nextafter(border, np.inf))))
+        need_measurements(test[-1])
     return tuple(train), tuple(test)
 
 
@@ -168,6 +169,8 @@ def compare(cases: Sequence[Case], before: FilterSetup, after: FilterSetup, *, t
 
 def performance(cases: Sequence[Case], filter_setup: FilterSetup) -> Performance:
     """Return the performance of a filter on the judged part of these cases."""
+    for case in cases:
+        need_measurements(case)
     judged = [_judged(case, filter_setup) for case in cases]
     total, number, squares = 0.0, 0, 0.0
     for innovations in (innovations for estimate, _ in judged for innovations in estimate.innovations.values()):

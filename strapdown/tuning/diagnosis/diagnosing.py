@@ -60,8 +60,6 @@ def diagnose(
     does not: a rate random walk ten times too small has hardly any effect on the NIS.
     """
     tail(probability)
-    if not any(len(series.time) for series in record.vectors):
-        raise InputError("record has no vector measurements, so there are no innovations to diagnose from")
     need_mekf(setup, "the search for causes")
     modelled = modelled_record(record, setup)
     truth = modelled.truth
@@ -69,6 +67,9 @@ def diagnose(
     model = Model(record=replace(modelled, truth=None), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
+    measured = [innovations for innovations in estimate.innovations.values() if len(innovations.time)]
+    if not measured:
+        raise InputError("record has no vector measurements in its time, so there are no innovations to diagnose from")
     kept = None if truth is None else truth.taken(slice(None, None, every))
     if judgement is None:
         judgement = consistency.judge(estimate, kept, confidence_level=probability)
@@ -76,8 +77,7 @@ def diagnose(
     accurate = modelled_record(record, replace(setup, integration=coning.ALGORITHMS[ACCURATE_ALGORITHM]))
     better = run(replace(model, record=replace(accurate, truth=None))).closer_than(base)
     considered = [*_causes(model, base, estimate), _commutation(record, setup, estimate, kept, better)]
-    worst = max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in estimate.innovations.values() if len(i.time))
-    if worst > GROSS:
+    if max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in measured) > GROSS:
         considered += conventions(model, base)
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
     evidence = [*judgement.findings, *(cause.finding for cause in considered)]
