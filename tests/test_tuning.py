@@ -635,6 +635,9 @@ def test_the_nees_is_that_of_the_states_whose_truth_is_known():
     assert tuning.compare([bare], BELIEVED, BELIEVED).after.nees == {}
     beside = tuning.compare([dataclasses.replace(bare, true_attitude=truth.attitude)], BELIEVED, BELIEVED)
     assert beside.after.nees == {"attitude": pytest.approx(nees["attitude"], rel=1e-9)}
+    other = case(2, duration=300.0)  # as long: the mean is that of both
+    alone, both = (tuning.compare(cases, BELIEVED, BELIEVED).after.nees for cases in ([other], [simulated_case, other]))
+    assert both == pytest.approx({name: 0.5 * (nees[name] + alone[name]) for name in nees})
     assert "(attitude)" in str(beside)
 
 
