@@ -47,7 +47,7 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
     for seed in (1, 2):
         case, result = tuned(seed, 1e-3)
         bare = dataclasses.replace(case, record=dataclasses.replace(case.record, truth=None))
-        examined = tuning.examined([bare], result.setup, result)
+        examined = tuning.examined([bare], result)
         (unmodelled,) = examined.unmodelled
         assert unmodelled.moves_with_the_rate
         size = unmodelled.scale_factor
@@ -70,7 +70,7 @@ def test_of_right_filters_hardly_one_is_suspected():
     suspected, gains = 0, []
     for seed in range(10, 13):
         case, result = tuned(seed)
-        examined = tuning.examined([case], result.setup, result)
+        examined = tuning.examined([case], result)
         (unmodelled,) = examined.unmodelled
         suspected += unmodelled.suspected
         gains.append(unmodelled.scale_factor.gain)
@@ -87,7 +87,7 @@ def test_measurements_with_a_sigma_for_each_axis_are_not_examined():
     record = dataclasses.replace(
         case.record, vectors=(dataclasses.replace(star, sigma=0.0, sigma_axes=[1e-4, 2e-4, 2e-4]), *others)
     )
-    assert tuning.examined([dataclasses.replace(case, record=record)], result.setup, result) is result
+    assert tuning.examined([dataclasses.replace(case, record=record)], result) is result
 
 
 def test_the_turns_are_those_of_the_body_without_its_bias():

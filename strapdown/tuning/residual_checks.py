@@ -139,7 +139,7 @@ def unmodelled(case: Case, filter_setup: FilterSetup) -> Unmodelled:
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
     if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):
-        causes = diagnosis.diagnose(record, used, initial, probability=PROBABILITY).causes
+        causes = diagnosis.diagnose(record, used, initial).causes
     return Unmodelled(
         record=case.name,
         judgement=judgement,
@@ -153,7 +153,7 @@ MAX_EXAMINED = 4
 """Maximum number of records examined for errors that the tuned filter does not model."""
 
 
-def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> Tuning:
+def examined(cases: Sequence[Case], tuning: Tuning) -> Tuning:
     """Return a tuning with tests of each record for errors that the filter does not model; without if its states model them already.
 
     The random walk of the bias has a note if a scale factor explains the innovations better.
@@ -163,7 +163,7 @@ def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> Tuni
         for case in cases
         for series in case.record.vectors
     )
-    if before.states is not None or by_axis:
+    if tuning.setup.states is not None or by_axis:
         return tuning
     tested = tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
     parameters = list(tuning.parameters)

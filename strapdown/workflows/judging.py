@@ -122,11 +122,9 @@ def diagnose(
         return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
     P = np.diag(result.variance[0]) if result.covariance is None else result.covariance[0]
     initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
-    judged = judgement or check(result)
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
-    causes = diagnosis.diagnose(
-        accepted(record, result), filter_setup, initial, probability=judged.confidence_level, judgement=judged
-    )
+    used = accepted(record, result)
+    causes = diagnosis.diagnose(used, filter_setup, initial, judgement=judgement or check(result))
     if filter_setup.robust is not None:
         return causes, "The filter weights measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in result.events):

@@ -111,7 +111,7 @@ def tune(
     objective = _objective(train, setup, names, truth=truth, gate=gate, spacing=spacing, threads=threads)
     at_once = 1 if truth and len(train) > 1 else threads  # searches, unless records are evaluated in parallel
     result = tuning.fit(objective, priors=priors, starts=starts, seed=seed, threads=at_once, progress=progress)
-    result = tuning.examined(train, setup, _completed(result, setup, held, threads))
+    result = tuning.examined(train, _completed(result, setup, held, threads))
     return dataclasses.replace(result, remarks=tuple(remarks))
 
 

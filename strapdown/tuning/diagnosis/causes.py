@@ -69,14 +69,11 @@ class Diagnosis(Listed):
         All hypotheses in order of rank.
     judgement : Judgement
         The verdict on the filter from statistics and causes together (Holm), so that neither contradicts the other.
-    probability : float
-        Minimum probability that a consistent filter passes and has no cause reported.
     """
 
     causes: tuple[Cause, ...]
     considered: tuple[Cause, ...]
     judgement: Judgement
-    probability: float
 
     def listing(self) -> Table:
         """Return the causes considered, the most likely first, as a table."""
@@ -117,12 +114,12 @@ class Diagnosis(Listed):
         Returns
         -------
         dict
-            All hypotheses with their figures and whether they are significant, the probability, and the verdict as of
+            All hypotheses with their figures and whether they are significant, and the verdict as of
             :meth:`strapdown.consistency.Judgement.summary`.
         """
         causes = [
             {**vars(cause), "significant": cause in self.causes, "alternative": cause in self.alternatives}
             for cause in self.considered
         ]
-        table = {"probability": self.probability, "causes": causes, "judgement": self.judgement.summary()}
+        table = {"causes": causes, "judgement": self.judgement.summary()}
         return plain(table)  # type: ignore[no-any-return]

@@ -12,7 +12,6 @@ import numpy as np
 from strapdown import coning, consistency, estimation, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
-from strapdown.consistency.bounds import tail
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
@@ -31,7 +30,6 @@ def diagnose(
     setup: FilterSetup,
     initial: estimation.State,
     *,
-    probability: float = 0.99,
     judgement: Judgement | None = None,
 ) -> Diagnosis:
     """Return the verdict on a filter by all evidence in a record, and the likely causes of its faults.
@@ -44,10 +42,9 @@ def diagnose(
         The filter's model. Gates and robust updates are disabled here, because they hide faults.
     initial : State
         Initial state of the filter.
-    probability : float
-        Minimum probability that a consistent filter passes and has no cause reported.
     judgement : Judgement, optional
-        Judgement of the filter's estimate by :func:`strapdown.consistency.judge`. Default: the filter is run and judged here.
+        Judgement of the filter's estimate by :func:`strapdown.consistency.judge`; its confidence level is that of the causes too.
+        Default: the filter is run and judged here, at 0.99.
 
     Returns
     -------
@@ -59,7 +56,6 @@ def diagnose(
     The filter is run about ten times per sensor, and a hundred times more for gross faults. Statistics may pass where a likelihood ratio
     does not: a rate random walk ten times too small has hardly any effect on the NIS.
     """
-    tail(probability)
     need_mekf(setup, "the search for causes")
     modelled = modelled_record(record, setup)
     truth = modelled.truth
@@ -72,7 +68,7 @@ def diagnose(
         raise InputError("record has no vector measurements in its time, so there are no innovations to diagnose from")
     kept = None if truth is None else truth.taken(slice(None, None, every))
     if judgement is None:
-        judgement = consistency.judge(estimate, kept, confidence_level=probability)
+        judgement = consistency.judge(estimate, kept)
     base = run(model)
     accurate = modelled_record(record, replace(setup, integration=coning.ALGORITHMS[ACCURATE_ALGORITHM]))
     better = run(replace(model, record=replace(accurate, truth=None))).closer_than(base)
@@ -84,7 +80,7 @@ def diagnose(
     together = consistency.concluded(
         evidence,
         judgement.limits,
-        probability,
+        judgement.confidence_level,
         parts={part.of: part.why for part in judgement.parts},
         required=judgement.required,
         unmodelled=judgement.unmodelled,
@@ -94,7 +90,6 @@ def diagnose(
         causes=tuple(cause for cause, significant in zip(considered, rejected, strict=True) if significant),
         considered=tuple(considered),
         judgement=together,
-        probability=probability,
     )
 
 
