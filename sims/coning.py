@@ -14,7 +14,7 @@ import numpy as np
 from strapdown import coning, montecarlo, plots
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo.coning_study import Drift, FilterOutcome, measured_drift, predicted_drift
+from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.motion import Coning
 from strapdown.scenarios import Scenario
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
@@ -53,15 +53,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
     algorithms = [
         coning.ALGORITHMS[name] for name in ("one-sample", "two-sample", "three-sample", "four-sample", "matched-4-11")
     ]
-    drifts = tuple(
-        Drift(
-            algorithm=algorithm.name,
-            samples=algorithm.samples,
-            measured=measured_drift(motion, rate, algorithm),
-            predicted=predicted_drift(motion, rate, algorithm),
-        )
-        for algorithm in algorithms
-    )
+    drifts = tuple(Drift.of(algorithm, motion, rate) for algorithm in algorithms)
 
     # 5. The same filter with each. Its model of the gyro's noise is exact; it does not model coning errors.
     noise = ProcessNoise(angle_random_walk=gyro.angle_random_walk, rate_random_walk=gyro.rate_random_walk)
@@ -78,8 +70,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
 
     # 6. The verdict: NEES and NIS at 20 epochs, with two-sided 99 % bounds.
     outcomes = tuple(
-        FilterOutcome(integration=a.name, statistics=s, epochs=np.arange(5, 101, 5))
-        for a, s in zip(algorithms, statistics, strict=True)
+        FilterOutcome(integration=a.name, statistics=s) for a, s in zip(algorithms, statistics, strict=True)
     )
 
     # 7. The figures.

@@ -324,7 +324,7 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
 
 def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
     """Return a peer's σ and its RMS errors over the judged epochs."""
-    judged = montecarlo.judged_epochs(len(statistics.time) - 1)
+    judged = statistics.judged_epochs
     size = 6 if statistics.has_bias else 3
     rms = np.sqrt(np.mean(statistics.rms_error[judged] ** 2, axis=0))[:size]
     sigma = np.sqrt(np.mean(statistics.sigma[judged] ** 2, axis=0))[:size]

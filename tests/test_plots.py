@@ -432,8 +432,7 @@ def test_error_states_are_drawn_with_three_sigma(run):
 
 @pytest.fixture(scope="module")
 def outcomes(statistics):
-    epochs = np.array([10, 20])
-    return [FilterOutcome(integration=name, statistics=statistics, epochs=epochs) for name in ("a", "b")]
+    return [FilterOutcome(integration=name, statistics=statistics) for name in ("a", "b")]
 
 
 def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes):
@@ -464,7 +463,7 @@ def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes)
 def test_judged_epochs_are_marked_and_their_bounds_drawn(statistics, outcomes):
     ax = plots.coning_consistency(outcomes).axes[0]
     judged = next(line for line in ax.lines if line.get_label() == "judged epoch")
-    np.testing.assert_array_equal(judged.get_xdata(), statistics.time[[10, 20]])
+    np.testing.assert_array_equal(judged.get_xdata(), statistics.time[statistics.judged_epochs])
     low, high = statistics.verdict(outcomes[0].epochs, "attitude", 0.99).simultaneous_bounds
     band = next(patch for patch in ax.patches if "99 %" in patch.get_label())
     np.testing.assert_allclose([band.get_y(), band.get_y() + band.get_height()], [low, high])

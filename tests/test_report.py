@@ -580,7 +580,7 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
         wanted = [statistic[-1, state] / size for statistic in (held.mean_error, held.rms_error, held.sigma)]
         quantiles = [held.error_quantile(q)[-1, state] / size for q in verdicts.QUANTILES]
         np.testing.assert_allclose(shown[-6:], [*wanted, *quantiles], rtol=6e-4)
-    covered = held.covered[verdicts.judged_epochs(len(held.time) - 1)][:, :3].mean(axis=(0, 1))
+    covered = held.covered[held.judged_epochs][:, :3].mean(axis=(0, 1))
     assert all(f"{100.0 * share:.2f} %" in content for share in covered)
     drawn, ellipses = [], []
     monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))

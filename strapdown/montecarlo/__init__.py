@@ -27,7 +27,6 @@ from strapdown.montecarlo.plan import read_dispersions as read_dispersions
 from strapdown.montecarlo.plan import whole_epochs as whole_epochs
 from strapdown.montecarlo.scalar import start as start
 from strapdown.montecarlo.statistics import Statistics
-from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge
 from strapdown.montecarlo.verdicts import summary
 

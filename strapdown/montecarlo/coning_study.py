@@ -10,19 +10,19 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
-from strapdown.checks import Array, InputError, count, positive
+from strapdown.checks import InputError, count, positive
 from strapdown.consistency import Judgement
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
-from strapdown.montecarlo.statistics import SUBSETS
+from strapdown.montecarlo.statistics import SUBSETS, Counts
 from strapdown.motion import Coning
 from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario
@@ -55,7 +55,6 @@ MIN_SAMPLES_A_CYCLE = 0.1
 MAX_STEPS = 60_000
 """Maximum number of steps of a run in which a drift is measured."""
 EPOCHS = 100
-VERDICT_EPOCHS = 20
 ANGLE_RANDOM_WALK, RATE_RANDOM_WALK = 0.08 * DEGREE_PER_ROOT_HOUR, 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
 """Noise of the gyro."""
 DIRECTION_SIGMA = 20.0 * ARCSECOND
@@ -164,6 +163,12 @@ class Drift:
     predicted: float
     """Drift by the formula; NaN if it does not apply."""
 
+    @classmethod
+    def of(cls, algorithm: coning.Algorithm, motion: Coning, rate: float) -> Drift:
+        """Return the drift of an algorithm under coning, sampled at a rate, Hz."""
+        measured, predicted = (drift(motion, rate, algorithm) for drift in (measured_drift, predicted_drift))
+        return cls(algorithm=algorithm.name, samples=algorithm.samples, measured=measured, predicted=predicted)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterOutcome:
@@ -171,13 +176,16 @@ class FilterOutcome:
 
     integration: str
     statistics: Statistics
-    epochs: Array = field(repr=False)
-    """Indices of the epochs judged."""
+
+    @property
+    def epochs(self) -> Counts:
+        """Indices of the epochs judged."""
+        return self.statistics.judged_epochs
 
     @functools.cached_property
     def judgement(self) -> Judgement:
-        """Verdict on the filter, that of any Monte Carlo, at the judged epochs."""
-        return self.statistics.judge(epochs=self.epochs)
+        """Verdict on the filter, that of any Monte Carlo."""
+        return self.statistics.judge()
 
     def summary(self) -> dict[str, Any]:
         """Return the outcome in degrees and hours, as in ``coning.json``. ANEES and NIS are per degree of freedom.
@@ -186,21 +194,17 @@ class FilterOutcome:
         """
         statistics, verdict = self.statistics, self.judgement.verdict
         nees = {subset: statistics.verdict(self.epochs, subset) for subset in SUBSETS}
-        square, variance = statistics.rms_error[self.epochs] ** 2, statistics.sigma[self.epochs] ** 2
+        row: dict[str, Any] = {"integration": self.integration, "runs": statistics.runs}
+        for what, values in (("rms", statistics.rms_error), ("sigma", statistics.sigma)):
+            square = values[self.epochs] ** 2
+            row[f"attitude_{what}_arcsec"] = float(np.sqrt(square[:, :3].mean()) / ARCSECOND)
+            row[f"bias_{what}_deg_per_hour"] = float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR)
+        for subset, part in nees.items():
+            name = "anees" if subset == "state" else f"anees_{subset}"
+            row |= {name: float(part.mean.mean()), f"{name}_bounds": list(part.bounds)}
         return {
-            "integration": self.integration,
-            "runs": statistics.runs,
-            "attitude_rms_arcsec": float(np.sqrt(square[:, :3].mean()) / ARCSECOND),
-            "attitude_sigma_arcsec": float(np.sqrt(variance[:, :3].mean()) / ARCSECOND),
-            "bias_rms_deg_per_hour": float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR),
-            "bias_sigma_deg_per_hour": float(np.sqrt(variance[:, 3:].mean()) / DEGREE_PER_HOUR),
+            **row,
             "bias_mean_deg_per_hour": (statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
-            "anees": float(nees["state"].mean.mean()),
-            "anees_bounds": list(nees["state"].bounds),
-            "anees_attitude": float(nees["attitude"].mean.mean()),
-            "anees_attitude_bounds": list(nees["attitude"].bounds),
-            "anees_bias": float(nees["bias"].mean.mean()),
-            "anees_bias_bounds": list(nees["bias"].bounds),
             "epochs": len(self.epochs),
             "epochs_outside": {subset: part.outside for subset, part in nees.items()},
             "nis": statistics.mean_nis,
@@ -340,9 +344,7 @@ SHOWN_DENOMINATOR = 10**7
 """Drift constants with a smaller denominator are also shown as fractions."""
 
 
-def _table(
-    title: str, columns: Sequence[Column], rows: Sequence[Any], notes: Sequence[str] = (), *, name: str
-) -> Table:
+def _table(title: str, columns: list[Column], rows: Sequence[Any], notes: Sequence[str] = (), *, name: str) -> Table:
     return Table(title, columns, [[row[column.key] for column in columns] for row in rows], notes, name=name)
 
 
@@ -415,35 +417,17 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     P. G. Savage, Strapdown inertial navigation integration algorithm design part 1: attitude algorithms, J. Guidance, Control, and
     Dynamics 21(1), 1998.
     """
-    scenario = parameters.scenario
     algorithms = parameters.algorithms
     motion = Coning(angle=parameters.angle, frequency=parameters.frequency)
-    drifts = tuple(
-        Drift(
-            algorithm=algorithm.name,
-            samples=algorithm.samples,
-            measured=measured_drift(motion, parameters.rate, algorithm),
-            predicted=predicted_drift(motion, parameters.rate, algorithm),
-        )
-        for algorithm in algorithms
-    )
+    drifts = tuple(Drift.of(algorithm, motion, parameters.rate) for algorithm in algorithms)
     noise = ProcessNoise(angle_random_walk=ANGLE_RANDOM_WALK, rate_random_walk=RATE_RANDOM_WALK)
-    setups = tuple(
-        FilterSetup(
-            process_noise=noise,
-            attitude_sigma=ATTITUDE_SIGMA,
-            bias_sigma=BIAS_SIGMA,
-            integration=algorithm,
-        )
-        for algorithm in algorithms
-    )
+    base = FilterSetup(process_noise=noise, attitude_sigma=ATTITUDE_SIGMA, bias_sigma=BIAS_SIGMA)
+    setups = [replace(base, integration=algorithm) for algorithm in algorithms]
     statistics = montecarlo.run(
-        scenario, setups, runs=parameters.runs, seed=parameters.seed, epochs=EPOCHS, progress=progress
+        parameters.scenario, setups, runs=parameters.runs, seed=parameters.seed, epochs=EPOCHS, progress=progress
     )
-    # The first judged epoch is late enough for the bias to have been observed.
-    epochs = np.linspace(EPOCHS // VERDICT_EPOCHS, EPOCHS, VERDICT_EPOCHS).astype(int)
     outcomes = tuple(
-        FilterOutcome(integration=algorithm.name, statistics=part, epochs=epochs)
+        FilterOutcome(integration=algorithm.name, statistics=part)
         for algorithm, part in zip(algorithms, statistics, strict=True)
     )
     return ConingStudy(parameters=parameters, drifts=drifts, outcomes=outcomes)

@@ -30,7 +30,14 @@ Parts = tuple[Statistics, ...]
 """Statistics of the same runs, one per plan."""
 
 MACHINES: dict[str, Any] = {lanes.NAME: lanes, scalar.NAME: scalar}
-"""Machines by name, the fast one first: modules as described in :mod:`strapdown.montecarlo.statistics`."""
+"""Machines by name, the fast one first. Each is a module with
+
+``NAME``, ``CHUNK``
+    Its name in files and tables; its default number of runs per chunk.
+``run_chunk(plan, first_run, runs) -> Statistics``, ``replay(plan, run) -> Replay``
+    Sums over these runs in an order that depends only on ``first_run`` and ``runs``; one run in full detail. Both may be called in several
+    threads, and run k is the same to the bit in any chunk, thread, vector width and host.
+"""
 
 AHEAD = 4
 """Maximum number of chunks per worker that are submitted and not yet merged; bounds the memory."""
@@ -245,10 +252,8 @@ def run_plan(
     Statistics
         Sums over all runs, merged in the order of the chunks.
     """
-    name = choose(plan, machine).machine
-    size = MACHINES[name].CHUNK if chunk is None else count("chunk", chunk)
-    work = Work(plans=(plan,), machine=name)
-    return _run(work, count("runs", runs), size, in_threads(threads) if workers is None else workers, progress)[0]
+    how = in_threads(threads) if workers is None else workers
+    return _run((plan,), choose(plan, machine).machine, runs, chunk, how, progress)[0]
 
 
 def run(
@@ -257,11 +262,11 @@ def run(
     *,
     runs: int,
     seed: int,
-    chunk: int | None = None,
+    epochs: int = 100,
+    nis_bins: int = 100,
     threads: int | None = None,
     machine: str = "scalar",
     progress: Callable[[int], None] | None = None,
-    **options: Any,
 ) -> list[Statistics]:
     """Run several filter setups on the same simulated runs and return the statistics of each.
 
@@ -277,32 +282,37 @@ def run(
         Number of independent runs.
     seed : int
         Seed of all random streams.
-    chunk, threads : int, optional
-        See :func:`run_plan`.
+    epochs, nis_bins : int, default 100
+        See :class:`Plan`.
     machine : {"scalar", "auto", "lanes"}
         "auto": the lanes if they support every setup.
-    progress : callable, optional
+    threads, progress : optional
         See :func:`run_plan`.
-    **options
-        Other fields of :class:`Plan`, such as ``epochs``.
 
     Returns
     -------
     list of Statistics
         One per setup.
     """
-    count("runs", runs)
-    plans = tuple(Plan(scenario=scenario, setup=setup, seed=seed, **options) for setup in setups)
+    common = {"scenario": scenario, "seed": seed, "epochs": epochs, "nis_bins": nis_bins}
+    plans = tuple(Plan(setup=setup, **common) for setup in setups)  # type: ignore[arg-type]
     names = {choose(plan, machine).machine for plan in plans}
-    work = Work(plans=plans, machine=names.pop() if len(names) == 1 else scalar.NAME)
-    size = MACHINES[work.machine].CHUNK if chunk is None else count("chunk", chunk)
-    return list(_run(work, runs, size, in_threads(threads), progress))
+    name = names.pop() if len(names) == 1 else scalar.NAME
+    return list(_run(plans, name, runs, None, in_threads(threads), progress))
 
 
-def _run(work: Work, runs: int, chunk: int, workers: Workers, progress: Callable[[int], None] | None) -> Parts:
+def _run(
+    plans: tuple[Plan, ...],
+    machine: str,
+    runs: int,
+    chunk: int | None,
+    workers: Workers,
+    progress: Callable[[int], None] | None,
+) -> Parts:
+    size = MACHINES[machine].CHUNK if chunk is None else count("chunk", chunk)
     total: Parts = ()
-    for parts in workers(work, chunks_of(runs, chunk)):
+    for parts in workers(Work(plans=plans, machine=machine), chunks_of(count("runs", runs), size)):
         total = tuple(map(merge, total, parts)) if total else parts
         if progress is not None:
             progress(parts[0].runs)
-    return tuple(replace(part, plan=plan) for part, plan in zip(total, work.plans, strict=True))
+    return tuple(replace(part, plan=plan) for part, plan in zip(total, plans, strict=True))

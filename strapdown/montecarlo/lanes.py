@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import estimation, quaternion, vectors
-from strapdown.checks import Array, count
+from strapdown.checks import Array
 from strapdown.estimation import forward, setup
 from strapdown.estimation.forward import Problem
 from strapdown.estimation.schedule import innovations_by_sensor, skipped_too
@@ -519,9 +519,8 @@ def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
 
 def replay(plan: Plan, run: int) -> Replay:
     """Return one run in full detail, bitwise identical to that of the campaign."""
-    number = count("run", run, minimum=0)
     group = _Group(plan, every=1, detail=True)
-    group.advance(number)
+    group.advance(run)
     problem, record = group.prepared.problem, group.prepared.record
     events, n = problem.events, group.prepared.kernels.N
     assert record.truth is not None

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import hashlib
 import weakref
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -16,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import consistency, estimation
-from strapdown.checks import Array, InputError, count
+from strapdown.checks import Array, InputError
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
@@ -64,26 +61,20 @@ def record_of(plan: Plan, run: int) -> ImuRecord:
 class _Remembered:
     """A motion that caches its last results: all runs evaluate it at the same times, at more cost than the filter's."""
 
-    _MAX_KEPT = 32
-
     def __init__(self, motion: Motion) -> None:
         self._motion = motion
-        self._known: OrderedDict[tuple[str, tuple[int, ...], bytes], Array] = OrderedDict()
+        self._cached = functools.lru_cache(maxsize=32)(self._evaluated)
         if hasattr(motion, "breaks"):
             self.breaks = motion.breaks
 
+    def _evaluated(self, what: str, times: bytes, shape: tuple[int, ...]) -> Array:
+        values = np.array(getattr(self._motion, what)(np.frombuffer(times).reshape(shape)))
+        values.flags.writeable = False  # shared by all runs
+        return values
+
     def _answer(self, what: str, time: ArrayLike) -> Array:
-        times = np.asarray(time, dtype=np.float64, order="C")
-        key = (what, times.shape, hashlib.blake2b(times.data, digest_size=16).digest())
-        answer = self._known.get(key)
-        if answer is None:
-            answer = np.array(getattr(self._motion, what)(times))
-            answer.flags.writeable = False  # shared by all runs
-            self._known[key] = answer
-            if len(self._known) > self._MAX_KEPT:  # times of a jittered clock, which do not recur
-                with contextlib.suppress(KeyError):
-                    self._known.popitem(last=False)
-        return answer
+        times = np.asarray(time, dtype=np.float64)
+        return self._cached(what, times.tobytes(), times.shape)
 
     attitude = functools.partialmethod(_answer, "attitude")
     body_rate = functools.partialmethod(_answer, "body_rate")
@@ -96,9 +87,8 @@ _SCENARIOS: weakref.WeakKeyDictionary[Plan, Scenario] = weakref.WeakKeyDictionar
 
 def replay(plan: Plan, run: int) -> Replay:
     """Return one run of a plan in full detail."""
-    number = count("run", run, minimum=0)
-    record = record_of(plan, number)
-    initial = start(record, plan.setup, plan.seed, number, plan.dispersions)
+    record = record_of(plan, run)
+    initial = start(record, plan.setup, plan.seed, run, plan.dispersions)
     estimate = setup.run(record, plan.setup, initial, full_covariance=True)
     return Replay(record=record, initial=initial, estimate=estimate)
 

@@ -1,22 +1,7 @@
 """Statistics over independent runs, in memory that does not depend on their number, and their merging.
 
-Requirements on a machine
--------------------------
-A *machine* is a module of this package with
-
-``NAME``, ``CHUNK``
-    Its name in files and tables; its default number of runs per chunk.
-``run_chunk(plan, first_run, runs) -> Statistics``
-    Runs ``first_run`` … ``first_run + runs − 1`` of the plan.
-``replay(plan, run) -> Replay``
-    One run in full detail, bitwise identical to that in a chunk.
-
-Run k of a plan must be bitwise identical for any chunk that contains it, number of threads, vector width and host. The sums of a chunk are
-taken over its runs in the order of their numbers (or in another order that depends only on ``first_run`` and ``runs``). Both functions must
-be safe to run in several threads.
-
-With m = epochs + 1 epochs at the filter steps 0, every, 2·every, … (``plan.every``; after the update with measurements at that time),
-errors e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the result is a :class:`Statistics`.
+The m = epochs + 1 epochs are at the filter steps 0, every, 2·every, … (``plan.every``), after the update with measurements at that time;
+errors are those of :func:`strapdown.consistency.errors`.
 """
 
 from __future__ import annotations
@@ -210,7 +195,7 @@ class Statistics(ByValue, Listed):
             "consistent" only if the runs would have shown an error of σ of attitude, bias and innovations by ``detectable_error``.
         """
         tail(confidence_level)
-        rows = judged_epochs(len(self.time) - 1) if epochs is None else np.array(list(epochs), int)
+        rows = self.judged_epochs if epochs is None else np.array(list(epochs), int)
         failed = int(self.runs - np.min(self.finite[rows]))
         findings = []
         for subset in self.subsets:
@@ -266,27 +251,32 @@ class Statistics(ByValue, Listed):
         return tuple(SUBSETS) if self.has_bias else ("attitude",)
 
     @property
-    def _runs_of_state(self) -> Array:
-        """Number of runs in the sums by epoch and state (m, 6)."""
-        estimated = np.where(self.has_bias | (np.arange(6) < 3), 1.0, 0.0)
-        return np.asarray(self.finite[:, None] * estimated)
+    def judged_epochs(self) -> Counts:
+        """Indices of at most 20 equally spaced epochs, without the start, where the error is drawn, not estimated."""
+        last = len(self.time) - 1
+        return np.unique(np.linspace(max(1, last // 20), last, min(20, last)).astype(np.int64))
 
     @property
     def failed(self) -> int:
         """Minimum number of runs that were not finite at some epoch."""
         return int(self.runs - self.finite.min())
 
+    def _mean(self, total: Any) -> Array:
+        """Return the mean over runs of sums by epoch and state (m, 6, …), NaN without runs; of the bias if it is not estimated."""
+        mean = _divided(total, self.finite.reshape(-1, *(1,) * (total.ndim - 1)))
+        if not self.has_bias:
+            mean[:, 3:] = mean[..., 3:] = np.nan
+        return mean
+
     @property
     def mean_error(self) -> Array:
         """Mean error at each epoch (m, 6)."""
-        return _divided(self.error_sum, self._runs_of_state)
+        return self._mean(self.error_sum)
 
     @property
     def mean_square_error(self) -> Array:
         """Mean of e eᵀ at each epoch (m, 6, 6), to which P should be equal."""
-        return _divided(
-            self.error_product_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None])
-        )
+        return self._mean(self.error_product_sum)
 
     @property
     def rms_error(self) -> Array:
@@ -296,7 +286,7 @@ class Statistics(ByValue, Listed):
     @property
     def covariance(self) -> Array:
         """The filter's covariance, mean over runs (m, 6, 6)."""
-        return _divided(self.covariance_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None]))
+        return self._mean(self.covariance_sum)
 
     @property
     def sigma(self) -> Array:
@@ -313,7 +303,7 @@ class Statistics(ByValue, Listed):
     @property
     def covered(self) -> Array:
         """Fraction of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a consistent filter."""
-        return _divided(self.coverage, self._runs_of_state[:, :, None])
+        return self._mean(self.coverage)
 
     @property
     def nis_time(self) -> Array:
@@ -391,7 +381,7 @@ class Statistics(ByValue, Listed):
             Quantiles, rad and rad/s.
         """
         quantile = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
-        return np.asarray(np.where(self._runs_of_state > 0.0, quantile, np.nan))
+        return np.asarray(np.where(np.isnan(self.mean_error), np.nan, quantile))
 
 
 class Layout(NamedTuple):
@@ -486,19 +476,13 @@ def _log_nees(statistics: Statistics, epochs: Counts, subset: str) -> Finding:
     )
 
 
-def _estimated(statistics: Statistics) -> slice:
-    """Return the estimated states: all, or those of the attitude."""
-    return slice(None) if "bias" in statistics.subsets else slice(3)
-
-
 def _mean_error(statistics: Statistics, epochs: Counts) -> Finding:
     """Return the finding on the mean error over the runs: Student's t, the worst of all epochs and states."""
     from scipy.special import stdtr
 
-    runs = statistics.runs
-    estimated = _estimated(statistics)
-    mean = statistics.error_sum[epochs][:, estimated] / runs
-    square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2)[:, estimated] / runs
+    runs, states = statistics.runs, 6 if statistics.has_bias else 3
+    mean = statistics.error_sum[epochs, :states] / runs
+    square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2)[:, :states] / runs
     t = np.abs(mean) / np.sqrt(np.maximum(square - mean**2, 1e-300) / (runs - 1))
     name = state_name(int(np.argmax(t.max(axis=0))))
     return Finding(
@@ -513,18 +497,18 @@ def _mean_error(statistics: Statistics, epochs: Counts) -> Finding:
 
 def _run_coverage(statistics: Statistics, epochs: Counts) -> Finding:
     """Return the finding on the fraction of errors within 1, 2 and 3 σ, the worst of all epochs and states."""
-    inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
+    inside = statistics.coverage[epochs, : 6 if statistics.has_bias else 3] / statistics.runs
     p = coverage_p_values(inside, statistics.runs)
-    _, state, k = np.unravel_index(int(np.argmin(p)), p.shape)
-    name = state_name(int(state))
-    value = float(inside.reshape(-1)[int(np.argmin(p))])
+    worst = np.unravel_index(int(np.argmin(p)), p.shape)
+    (_, state, k), value = map(int, worst), float(inside[worst])
+    name = state_name(state)
     return Finding(
         name="coverage",
         of=name,
         value=value,
         p_value=min(1.0, p.size * float(p.min())),
         samples=statistics.runs,
-        means=f"{100.0 * value:.3g} % of the {name} errors lie within {int(k) + 1} σ at the worst epoch",
+        means=f"{100.0 * value:.3g} % of the {name} errors lie within {k + 1} σ at the worst epoch",
     )
 
 
@@ -574,8 +558,3 @@ def worst(run: Counts, score: Array) -> tuple[Counts, Array]:
     """Return the WORST runs and their scores, in descending order; equal scores in the order of the runs."""
     order = np.lexsort((run, -score))[:WORST]
     return run[order], score[order]
-
-
-def judged_epochs(epochs: int) -> Counts:
-    """Return the indices of at most 20 equally spaced epochs, without the start, where the error is drawn, not estimated."""
-    return np.unique(np.linspace(max(1, epochs // 20), epochs, min(20, epochs)).astype(np.int64))

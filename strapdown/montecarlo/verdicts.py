@@ -14,7 +14,7 @@ from strapdown.consistency import Judgement
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
-from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
+from strapdown.montecarlo.statistics import COVERED, Statistics
 from strapdown.results import Column, Table
 
 QUANTILES = (0.5, 0.95, 0.997)
@@ -47,7 +47,6 @@ def efficiency(statistics: Statistics, bound: Array) -> Array:
 def summary(
     statistics: Statistics,
     *,
-    epochs: Counts | None = None,
     judgement: Judgement | None = None,
     bound: Array | None = None,
 ) -> dict[str, Any]:
@@ -57,10 +56,8 @@ def summary(
     ----------
     statistics : Statistics
         Statistics of the filter to be tested.
-    epochs : array of int, optional
-        Indices of the epochs judged. Default: 20 evenly spaced ones.
     judgement : Judgement, optional
-        Verdict on these epochs, if known. Default: that of :meth:`Statistics.judge`.
+        Verdict, if known. Default: that of :meth:`Statistics.judge`.
     bound : ndarray (m, 6, 6), optional
         Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), with which the errors are compared.
 
@@ -69,8 +66,8 @@ def summary(
     dict
         Plain values for JSON.
     """
-    rows = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    judgement = judgement or statistics.judge(epochs=rows)
+    rows = statistics.judged_epochs
+    judgement = judgement or statistics.judge()
     covered = statistics.covered[rows]
     table = {
         "judgement": judgement.summary(),
@@ -85,7 +82,7 @@ def summary(
             **({"bias": covered[:, 3:].mean(axis=(0, 1))} if statistics.has_bias else {}),
         },
         "last_epoch": _last_epoch(statistics),
-        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, rows)}),
+        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound)}),
         "worst_runs": [
             {"run": int(run), "largest_nees": score}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
@@ -111,9 +108,17 @@ def _errors(summary: Mapping[str, Any]) -> Table:
         if what in summary["coverage"]  # not all filters estimate a bias
         for k, axis in enumerate("xyz")
     ]
+    notes = []
+    if ratios := dict(summary.get("rms_over_root_cramer_rao_bound", {})):
+        low, high = ratios.pop("bounds_of_an_efficient_filter")
+        axes = "; ".join(f"{name} {', '.join(f'{x:.3f}' for x in values)}" for name, values in ratios.items())
+        notes.append(
+            f"RMS error divided by the root of the Cramér–Rao bound, by axis: {axes} (at one epoch {low:.3f} to {high:.3f} for an "
+            "efficient filter)."
+        )
     title = f"Errors at {last['time_s']:g} s, {summary['runs']} runs; quantiles of the absolute error"
     columns = (Column("", "state"), Column("unit", "unit"), *map(Column, labels, sizes))
-    return Table(title, columns, rows, _efficiency_words(summary), left=2, name="errors")
+    return Table(title, columns, rows, notes, left=2, name="errors")
 
 
 def _coverage(summary: Mapping[str, Any]) -> Table:
@@ -134,29 +139,11 @@ def _coverage(summary: Mapping[str, Any]) -> Table:
     return Table(title, columns, rows, notes, name="coverage")
 
 
-def _efficiency_words(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    ratios = summary.get("rms_over_root_cramer_rao_bound")
-    if ratios is None:
-        return ()
-    low, high = ratios["bounds_of_an_efficient_filter"]
-    axes = "; ".join(
-        f"{name} {', '.join(f'{x:.3f}' for x in ratios[name])}" for name in ("attitude", "bias") if name in ratios
-    )
-    return (
-        f"RMS error divided by the root of the Cramér–Rao bound, by axis: {axes} (at one epoch {low:.3f} to {high:.3f} for an efficient "
-        "filter).",
-    )
-
-
-def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, Any]:
+def _efficiency(statistics: Statistics, bound: Array) -> dict[str, Any]:
     """Return the RMS over the judged epochs of the ratio of RMS error to the root of the bound, by axis, and its bounds at one epoch."""
-    ratio = np.sqrt(np.mean(efficiency(statistics, bound)[epochs] ** 2, axis=0))
-    parts = {"attitude": ratio[:3], "bias": ratio[3:]}
-    low, high = consistency.mean_bounds(1, statistics.runs)
-    return {
-        **{name: values for name, values in parts.items() if np.isfinite(values).all()},
-        "bounds_of_an_efficient_filter": [low**0.5, high**0.5],
-    }
+    ratio = np.sqrt(np.mean(efficiency(statistics, bound)[statistics.judged_epochs] ** 2, axis=0))
+    parts = {"attitude": ratio[:3], **({"bias": ratio[3:]} if statistics.has_bias else {})}
+    return {**parts, "bounds_of_an_efficient_filter": np.sqrt(consistency.mean_bounds(1, statistics.runs))}
 
 
 def _last_epoch(statistics: Statistics) -> dict[str, Any]:
@@ -166,10 +153,7 @@ def _last_epoch(statistics: Statistics) -> dict[str, Any]:
         ("attitude", slice(0, 3), "arcsec", units.ARCSECOND),
         ("bias", slice(3, 6), "deg_per_hour", units.DEGREE_PER_HOUR),
     ):
-        for what in ("mean_error", "rms_error", "sigma"):
-            values = getattr(statistics, what)[-1, rows] / factor
-            result[f"{name}_{what}_{unit}"] = values
-        for q in QUANTILES:
-            values = statistics.error_quantile(q)[-1, rows] / factor
-            result[f"{name}_error_quantile_{q:g}_{unit}"] = values
+        values = {what: getattr(statistics, what) for what in ("mean_error", "rms_error", "sigma")}
+        values |= {f"error_quantile_{q:g}": statistics.error_quantile(q) for q in QUANTILES}
+        result |= {f"{name}_{what}_{unit}": value[-1, rows] / factor for what, value in values.items()}
     return result

@@ -13,7 +13,7 @@ from matplotlib.patches import Ellipse
 from strapdown.checks import Array, one_of
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
-from strapdown.montecarlo.statistics import COVERED, SUBSETS, judged_epochs
+from strapdown.montecarlo.statistics import COVERED, SUBSETS
 from strapdown.plots import style
 from strapdown.units import angle_unit, rate_unit
 
@@ -101,7 +101,7 @@ def runs_overview(statistics: Statistics) -> Figure:
     figure, axes = style.new_figure(1, 3, size=(10.5, 4.2))
     axes[1].set_visible(statistics.has_bias)
     findings = statistics.judge().findings
-    judged = judged_epochs(len(statistics.time) - 1)
+    judged = statistics.judged_epochs
     label = "99 % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
