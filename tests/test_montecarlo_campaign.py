@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import time
-import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from functools import cache, partial
@@ -522,32 +521,6 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
     assert "continue with --resume" in said
     assert signal.getsignal(signal.SIGTERM) == before
     assert campaign.read("short-montecarlo.h5").statistics.runs == 2 * scalar.CHUNK
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command, heeded, monkeypatch, number):
-    original, written = campaign._write, []
-
-    def cleared(_):
-        signal.raise_signal(number)
-        for _ in range(1000):  # the handler is called between two turns; what it raises is dropped with the callback
-            pass
-
-    def interrupted(*arguments):
-        written.append(arguments)
-        if len(written) == 1:  # in the thread that receives signals
-            gone = {1}
-            reference = weakref.ref(gone, cleared)
-            del gone
-            assert reference() is None
-        original(*arguments)
-
-    monkeypatch.setattr(campaign, "_write", interrupted)
-    status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
-    assert status == 130
-    assert "continue with --resume" in said
-    assert campaign.read("short-montecarlo.h5").statistics.runs == scalar.CHUNK
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -214,37 +214,29 @@ def run(
     """
     target = Path(path)
     count("runs", runs)
-    table = plan.to_table()
     engine = choose(plan, machine)
-    with locked(target), _asked_to_stop() as stop_if_asked:
+    with locked(target), _sigterm_as_ctrl_c():
         if not resume and not overwrite and _would_lose(target):
             raise InputError(
                 f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
             )
         held = read(target) if resume and target.exists() else None
         default = MACHINES[engine.machine].CHUNK if held is None else held.chunk
-        size = default if chunk is None else count("chunk", chunk)
-        if held is not None:
-            _need_same(target, held, plan, engine.machine, size, runs)
-        whole = None if held is None else held.whole
         start = Campaign(
             plan=plan,
             machine=engine.machine,
             reason=engine.reason,
-            chunk=size,
+            chunk=default if chunk is None else count("chunk", chunk),
             runs=runs,
-            statistics=held.statistics if held is not None and held.finished_runs == runs else whole,
-            whole=whole,
+            statistics=None,
             **identity()._asdict(),
-            seconds=0.0 if held is None else held.seconds,
         )
-        advance = progress or (lambda number: None)
-
-        def advanced(number: int) -> None:
-            advance(number)
-            stop_if_asked()
-
-        return _compute(start, target, table, in_threads(threads) if workers is None else workers, advanced)
+        if held is not None:
+            _need_same(target, held, start)
+            known = held.statistics if held.finished_runs == runs else held.whole
+            start = replace(start, statistics=known, whole=held.whole, seconds=held.seconds)
+        how = in_threads(threads) if workers is None else workers
+        return _compute(start, target, how, progress or (lambda number: None))
 
 
 def _would_lose(path: Path) -> bool:
@@ -256,45 +248,34 @@ def _would_lose(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _asked_to_stop() -> Iterator[Callable[[], None]]:
+def _sigterm_as_ctrl_c() -> Iterator[None]:
     """Treat SIGTERM, which batch systems send before they kill a process, as Ctrl-C, so that completed runs are written.
 
-    Yields a function that raises again after a signal: Python drops an exception that is raised while a weak reference is cleared. Only the
-    main thread receives signals; one that whoever started the process had ignored stays ignored.
+    Only the main thread receives signals; one that whoever started the process had ignored stays ignored.
     """
-    asked: list[int] = []
-
-    def stop(*signals: Any) -> None:
-        asked.extend(signals[:1])
-        if asked:
-            raise KeyboardInterrupt
-
-    main = threading.current_thread() is threading.main_thread()
-    heeded = [
-        number for number in (signal.SIGTERM, signal.SIGINT) if main and signal.getsignal(number) != signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, stop) for number in heeded}
+    before = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        yield stop
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGTERM, before)
 
 
-def _compute(
-    campaign: Campaign, path: Path, table: Mapping[str, Any], workers: Workers, progress: Callable[[int], None]
-) -> Campaign:
+def _compute(campaign: Campaign, path: Path, workers: Workers, progress: Callable[[int], None]) -> Campaign:
     """Compute the missing chunks; write at once, at intervals, and at the end or an exception; return the last written state."""
     statistics, whole, begun = campaign.statistics, campaign.whole, time.perf_counter()
 
     def write() -> Campaign:
         now = replace(
             campaign,
-            statistics=None if statistics is None else replace(statistics, plan=campaign.plan),
+            statistics=statistics and replace(statistics, plan=campaign.plan),
             whole=whole,
             seconds=campaign.seconds + time.perf_counter() - begun,
         )
-        _write(path, now, table)
+        _write(path, now)
         return now
 
     if campaign.finished_runs:
@@ -317,46 +298,42 @@ def _compute(
     return written
 
 
-def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
-    """Raise if the file is of another plan, naming the first difference."""
-    wanted = _flat(plan.to_table()) | {"machine": machine, "chunk": chunk, **identity()._asdict()}
-    there = _flat(held.plan.to_table()) | {
-        name: getattr(held, name) for name in ("machine", "chunk", *Identity._fields)
-    }
-    for name in sorted(wanted.keys() | there.keys()):
-        if wanted.get(name) != there.get(name):
+def _need_same(target: Path, held: Campaign, wanted: Campaign) -> None:
+    """Raise if the campaign of a file is another one, naming the first difference."""
+    here, there = (
+        dict(_values(campaign.plan.to_table()))
+        | {name: getattr(campaign, name) for name in ("machine", "chunk", *Identity._fields)}
+        for campaign in (wanted, held)
+    )
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
             of_code = name in ("version", "sources")
             remedy = "continue it with the strapdown that began it" if of_code else "give the value in the file"
-            held_value, value = (
-                "not given" if table.get(name) in (None, "") else table[name] for table in (there, wanted)
-            )
             raise InputError(
-                f"{target} is of another campaign; {name} is {held_value} there and {value} here; {remedy}, or choose another file"
+                f"{target} is of another campaign; {name} is {there.get(name, 'not given')} there and {here.get(name, 'not given')} here; "
+                f"{remedy}, or choose another file"
             )
-    if runs < held.finished_runs:
+    if wanted.runs < held.finished_runs:
         raise InputError(
-            f"{target} holds {held.finished_runs} runs already, more than the {runs} wanted; give more runs"
+            f"{target} holds {held.finished_runs} runs already, more than the {wanted.runs} wanted; give more runs"
         )
 
 
-def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
-    """Return nested tables and lists of tables flattened, names joined by dots."""
-    result: dict[str, Any] = {}
-    for name, value in table.items():
-        inner = f"{place}{name}"
-        if isinstance(value, Mapping):
-            result.update(_flat(value, f"{inner}."))
-        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
-            result.update(_flat({str(i): item for i, item in enumerate(value)}, f"{inner}."))
-        else:
-            result[inner] = value
-    return result
+def _values(content: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested tables and lists of tables with their places, names joined by dots."""
+    tables = isinstance(content, list) and content and isinstance(content[0], Mapping)
+    inside = enumerate(content) if tables else content.items() if isinstance(content, Mapping) else None
+    if inside is None:
+        yield place, content
+    else:
+        for name, value in inside:
+            yield from _values(value, f"{place}.{name}" if place else str(name))
 
 
 # -------------------------------------------------------------------------------------------------------------------------- file
 
 
-def _write(path: Path, campaign: Campaign, table: Mapping[str, Any]) -> None:
+def _write(path: Path, campaign: Campaign) -> None:
     import h5py
     import numba
 
@@ -371,7 +348,7 @@ def _write(path: Path, campaign: Campaign, table: Mapping[str, Any]) -> None:
             "conventions": CONVENTIONS,
             "scenario": scenarios.scenario_to_toml(plan.scenario),
             "filter": setup.to_toml(plan.setup),
-            "plan": json.dumps(table, default=float),
+            "plan": json.dumps(plan.to_table(), default=float),
             "digest": plan.digest,
             "seed": plan.seed,
             "machine": campaign.machine,
@@ -407,24 +384,15 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
     """Return the statistics in a group; their shapes must be those of the plan."""
-    attributes = reading.attributes(group)
     arrays = {name: reading.numbers(group, name) for name in ARRAYS}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
     lengths = lengths_of(plan) | {"worst": len(arrays["worst_run"]), "examples": len(arrays["example_run"])}
-    for name, value in arrays.items():
-        layout = ARRAYS[name]
-        wanted = tuple(lengths.get(n, n) for n in layout.shape)
-        sums = layout.shape[0] == "epochs" and name != "time"  # sums over finite runs
-        if value.shape != wanted or (sums and not np.isfinite(value).all()):
-            raise InputError(
-                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign again"
-            )
-        if value.dtype.kind != ("i" if layout.counts else "f"):
-            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign again")
-    names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
-    if names != plan.sensors:
-        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign again")
-    return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, plan=plan, **arrays)
+    for name, layout in ARRAYS.items():
+        shape, kind = tuple(lengths.get(n, n) for n in layout.shape), "i" if layout.counts else "f"
+        if arrays[name].shape != shape or arrays[name].dtype.kind != kind:
+            raise InputError(f"{place}: {name} does not fit the plan; the file is damaged: run the campaign again")
+    runs = count(f"{place}: runs", reading.attributes(group)["runs"])
+    return Statistics(runs=runs, sensors=plan.sensors, plan=plan, **arrays)
 
 
 def read(path: str | os.PathLike[str]) -> Campaign:

@@ -188,7 +188,7 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         **arrays,
     )
     held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=statistics)
-    campaign._write(path, held, plan.to_table())
+    campaign._write(path, held)
 
 
 _TRACKER = """[[sensors]]
