@@ -76,10 +76,11 @@ def test_an_error_on_a_worker_comes_out(client):
 
 @pytest.mark.parametrize(("name", "value"), [("version", "0.0.1"), ("sources", "0123"), ("arithmetic", "no FMA")])
 def test_a_worker_of_another_version_edit_or_rounding_is_refused(client, monkeypatch, name, value):
-    other = engine.identity()._replace(**{name: value})
-    assert cluster._chunk(b"no work", 0, 2, other) == (engine.identity(), ())  # nothing is unpacked or computed
-    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs, wanted: (other, ()))
-    with pytest.raises(InputError, match=f"a worker has another {name} of strapdown, {value}, than this process, "):
+    wanted = engine.identity()._replace(**{name: value})
+    monkeypatch.setattr(cluster, "identity", iter([wanted, engine.identity()]).__next__)  # here, then on the worker
+    monkeypatch.setattr(cluster, "_work", lambda payload: pytest.fail("unpacked"))
+    message = f"a worker has another {name} of strapdown, .*, than the process that uses it, {value}, and may"
+    with pytest.raises(InputError, match=message):
         montecarlo.run_plan(PLAN, runs=2, chunk=2, machine="scalar", workers=cluster.on_dask(client))
 
 

@@ -142,9 +142,9 @@ def _lost(client: Any, error: object) -> InputError:
 
 
 def _result(distributed: Any, client: Any, future: Any, runs: str) -> Parts:
-    """Return what a worker computed, if it is of the same identity."""
+    """Return what a worker computed."""
     try:
-        there, parts = future.result()
+        parts: Parts = future.result()
     except distributed.KilledWorker:
         raise InputError(
             f"{runs} were lost because every worker that computed them died; check the workers' logs and memory"
@@ -155,20 +155,18 @@ def _result(distributed: Any, client: Any, future: Any, runs: str) -> Parts:
         ) from None
     except (CancelledError, distributed.comm.CommClosedError) as error:
         raise _lost(client, error) from None
-    for name, own, other in zip(Identity._fields, identity(), there, strict=True):
+    return parts
+
+
+def _chunk(payload: bytes, first_run: int, runs: int, wanted: Identity) -> Parts:
+    """Compute a chunk on a worker, if it is of the wanted identity."""
+    for name, own, other in zip(Identity._fields, identity(), wanted, strict=True):
         if own != other:
             raise InputError(
-                f"a worker has another {name} of strapdown, {other}, than this process, {own}, and may compute other bits; install the "
-                "same everywhere, on processors of one kind, and restart the workers"
+                f"a worker has another {name} of strapdown, {own}, than the process that uses it, {other}, and may compute other bits; "
+                "install the same everywhere, on processors of one kind, and restart the workers"
             )
-    result: Parts = parts
-    return result
-
-
-def _chunk(payload: bytes, first_run: int, runs: int, wanted: Identity) -> tuple[Identity, Parts]:
-    """Compute a chunk on a worker, if it is of the wanted identity; return it with the worker's."""
-    own = identity()
-    return own, _work(payload)(first_run, runs) if own == wanted else ()
+    return _work(payload)(first_run, runs)
 
 
 @functools.lru_cache(maxsize=4)
