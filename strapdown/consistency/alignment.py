@@ -36,14 +36,17 @@ class Alignment:
     """Rotation vector (3,), rad, from the estimate's fixed frame to the truth's."""
     body: Array
     """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
-    sigma: Array
-    """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,); 0 for those not estimated."""
     covariance: Array
-    """Their covariance (7, 7)."""
+    """Covariance (7, 7) of fixed, body, rad, and offset, s; 0 for those not estimated."""
     estimated: tuple[str, ...]
     """Which of :data:`ALIGNED` were estimated and removed."""
     residual: float
     """RMS of the remaining angle, rad."""
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,)."""
+        return np.sqrt(np.diag(self.covariance))
 
     def summary(self) -> dict[str, Any]:
         """Return the differences as plain values for JSON."""
@@ -224,33 +227,27 @@ def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple
 
 def fit(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> Alignment:
     """Return offset and rotations by least squares of the remaining angle; σ from the effective number of residuals."""
-    free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
-    starts = _initial_rotations(own, theirs, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
     best: Alignment | None = None
-    for fixed, body in starts:
-        if (not free[0] and abs(fixed[0]) < 1.0) or (not free[3] and abs(body[0]) < 1.0):
-            continue
-        fitted = _descended(own, theirs, free, fixed, body, offset, names)
-        if best is None or fitted.residual < 0.999 * best.residual:
-            best = fitted
+    for fixed, body in _initial_rotations(own, theirs, offset):
+        if ("fixed" in names or fixed[0] == 1.0) and ("body" in names or body[0] == 1.0):
+            fitted = _descended(own, theirs, names, fixed, body, offset)
+            best = fitted if best is None or fitted.residual < 0.999 * best.residual else best
     assert best is not None
     return best
 
 
 def _descended(
-    own: Series, theirs: Series, free: np.ndarray, fixed: Array, body: Array, offset: float, names: tuple[str, ...]
+    own: Series, theirs: Series, names: tuple[str, ...], fixed: Array, body: Array, offset: float
 ) -> Alignment:
+    free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
     covariance = np.zeros((7, 7))
-    residual = np.inf
     common = min(own.time[-1] + offset, theirs.time[-1]) - max(own.time[0] + offset, theirs.time[0])
     near = offset + np.array([-1.0, 1.0]) * min(LONGEST_OFFSET, 0.5 * common)  # half of the common time remains common
     for _ in range(20):
         matched, truth = at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
-        r = turns(aligned, truth.attitude)
-        now = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
+        left = r = turns(aligned, truth.attitude)
         if not free.any():
-            residual = now
             break
         J = jacobian(matched.time, aligned, truth)[:, :, free]
         information = np.einsum("mij,mik->jk", J, J)
@@ -267,17 +264,15 @@ def _descended(
         fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
         body = quaternion.normalize(quaternion.multiply(body, quaternion.exp(step[3:6])))
         offset = float(np.clip(offset + step[6], *near))
-        residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
         if np.all(np.abs(step) <= 1e-3 * np.sqrt(np.diag(covariance)) + 1e-12):
             break
     return Alignment(
         offset=offset,
         fixed=quaternion.log(fixed),
         body=quaternion.log(body),
-        sigma=np.sqrt(np.diag(covariance)),
         covariance=covariance,
         estimated=tuple(name for name in ALIGNED if name in names),
-        residual=residual,
+        residual=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
     )
 
 

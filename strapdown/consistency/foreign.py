@@ -36,7 +36,7 @@ from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_
 from strapdown.records import Estimate, Innovations, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
-from strapdown.units import DEGREE, DEGREE_PER_HOUR
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from strapdown.recordings.attitudes import Attitudes
@@ -47,7 +47,6 @@ poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
 SCALE = "σ wrong by one factor"
-NO_BIAS = "gyro bias held at zero"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,17 +117,15 @@ class Checked:
             The verdict as of :meth:`Judgement.summary`, with the definition of the covariance, explanations, remarks and
             alignment (degrees, s).
         """
-        table: dict[str, Any] = {
+        return {
             **self.judgement.summary(),
             "error_frame": self.error_frame,
             "error_frame_probability": dict(self.frame_probability),
             "explanations": [vars(explanation) for explanation in self.explanations],
             "remarks": list(self.remarks),
             "accuracy": None if self.accuracy is None else self.accuracy.summary(),
+            **({} if self.alignment is None else {"alignment": self.alignment.summary()}),
         }
-        if self.alignment is not None:
-            table["alignment"] = self.alignment.summary()
-        return table
 
 
 def check_attitudes(
@@ -184,70 +181,49 @@ def check_attitudes(
                 f"{own.source} has no innovations, so it cannot be judged without a truth; give {Hint('truth')}, attitudes over the same "
                 "time"
             )
-        estimate = without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+        estimate = without_covariance(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
         estimate = replace(estimate, motion=own.motion)
         return Checked(judgement=judge(estimate, **how), estimate=estimate)
+    declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
+    one_of("error_frame", declared, ("find", *ERROR_FRAMES))
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
     origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
-    declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
-    checked = _checked(
-        series_of("", own.seconds(origin), own.attitude, own.covariance, own.bias),
-        series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement),
-        own.innovations,
-        own.motion,
-        declared,
-        align,
-        how,
-    )
-    declares = () if declared == error_frame else (f"the file declares that its covariance is of the {declared} error",)
-    estimate = replace(checked.estimate, origin=Origin(source=own.source), details={"truth": truth.source})
-    return replace(checked, estimate=estimate, remarks=(*checked.remarks, *declares))
-
-
-def _checked(
-    own: Series,
-    theirs: Series,
-    innovations: Mapping[str, Innovations],
-    motion: str,
-    error_frame: str,
-    align: str | Iterable[str],
-    how: Mapping[str, Any],
-) -> Checked:
-    """Return the verdict on a history; ``how``: options of :func:`judge`."""
-    if error_frame != "find":
-        one_of("error_frame", error_frame, ERROR_FRAMES)
-    wanted = _wanted(align)
-    if own.covariance is not None and (own.bias is None or theirs.bias is None):
-        own = replace(own, bias=None, covariance=own.covariance[:, :3, :3])
+    with_bias = own.bias is not None and truth.bias is not None
+    P = own.covariance if with_bias or own.covariance is None else own.covariance[:, :3, :3]
+    whole = series_of("", own.seconds(origin), own.attitude, P, own.bias if with_bias or P is None else None)
+    theirs = series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement)
     remarks: list[str] = []
-    whole, alignment = align_series(own, theirs, wanted, remarks)
-    own, truth = at_common_times(whole, theirs, alignment.offset)
+    whole, alignment = align_series(whole, theirs, _wanted(align), remarks)
+    common, true = at_common_times(whole, theirs, alignment.offset)
     remarks += alignment.words
-    aligned = in_truth_frames(own.attitude, alignment)
-    if own.covariance is None:
-        estimate = without_truth(own.time, aligned, innovations)
-        frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
+    aligned = in_truth_frames(common.attitude, alignment)
+    frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
+    if common.covariance is None:
+        estimate = without_covariance(common.time, aligned, own.innovations)
     else:
-        readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
-        readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
-        error = turns(aligned, truth.attitude)
+        readings = {name: read_as(name, common.covariance, common.attitude) for name in ERROR_FRAMES}
+        readings = {name: _in_truth_axes(P, common, true, alignment) for name, P in readings.items()}
+        error = turns(aligned, true.attitude)
         probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-        frame, words = _chosen_frame(error_frame, probabilities)
+        frame, words = _chosen_frame(declared, probabilities)
         remarks += words
         body = quaternion.conjugate(quaternion.exp(alignment.body))
-        turned = None if own.bias is None else quaternion.rotate(body, own.bias)
-        estimate = Estimate.from_arrays(own.time, aligned, readings[frame], bias=turned, innovations=innovations)
+        bias = None if common.bias is None else quaternion.rotate(body, common.bias)
+        estimate = Estimate.from_arrays(common.time, aligned, readings[frame], bias=bias, innovations=own.innovations)
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
-        moved, level = Series(own.time, aligned, bias=own.bias), how["confidence_level"]
-        explained = explanations(error, readings, frame, probabilities, truth, moved, confidence_level=level)
-    estimate = replace(estimate, motion=motion)
+        derivatives = jacobian(common.time, aligned, true)
+        explained = explanations(error, readings, frame, probabilities, derivatives, confidence_level=confidence_level)
+    if declared != error_frame:
+        remarks.append(f"the file declares that its covariance is of the {declared} error")
+    estimate = replace(estimate, truth=true, motion=own.motion)
+    estimate = replace(estimate, origin=Origin(source=own.source), details={"truth": truth.source})
     return Checked(
-        judgement=judge(estimate, truth, **how),
-        estimate=replace(estimate, truth=truth),
+        judgement=judge(estimate, **how),
+        estimate=estimate,
         alignment=alignment,
         error_frame=frame,
-        frame_probability=probabilities if error_frame == "find" else {},
+        frame_probability=probabilities if declared == "find" else {},
         explanations=explained,
         remarks=tuple(remarks),
         accuracy=accuracy_of(whole, theirs),
@@ -257,12 +233,15 @@ def _checked(
 def _chosen_frame(wanted: str, probabilities: Mapping[str, float]) -> tuple[str, list[str]]:
     """Return the definition of the covariance, given or found, and the remark on it."""
     best = max(probabilities, key=lambda name: probabilities[name])
-    if wanted == "find":
-        frame = best if probabilities[best] >= DECIDED else "body"
-        return frame, [_frame_words(frame, probabilities)]
-    if probabilities[wanted] < 0.01:
-        return wanted, [f"the covariance is read as {wanted}, as given; the errors fit far better read as {best}"]
-    return wanted, []
+    if wanted != "find":
+        far = probabilities[wanted] < 0.01
+        words = f"the covariance is read as {wanted}, as given; the errors fit far better read as {best}"
+        return wanted, [words] if far else []
+    said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in probabilities.items())
+    if probabilities[best] >= DECIDED:
+        return best, [f"the covariance is read as {best} ({said}, found from the errors)"]
+    words = f"the errors do not decide how the covariance is defined ({said}): it is read as body"
+    return "body", [f"{words}; {Hint('error_frame')} names another"]
 
 
 def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
@@ -275,7 +254,7 @@ def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
     return tuple(one_of("align", name, (*ALIGNED, "auto", "none")) for name in names)
 
 
-def without_truth(time: Array, attitude: Array, innovations: Mapping[str, Innovations]) -> Estimate:
+def without_covariance(time: Array, attitude: Array, innovations: Mapping[str, Innovations]) -> Estimate:
     """Return an estimate without covariances, so that only its innovations can be judged."""
     return Estimate.from_arrays(time, attitude, np.full((len(time), 3, 3), np.nan), innovations=innovations)
 
@@ -317,16 +296,6 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
     return {name: value / sum(likelihood.values()) for name, value in likelihood.items()}
 
 
-def _frame_words(frame: str, probabilities: Mapping[str, float]) -> str:
-    said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in probabilities.items())
-    if probabilities[frame] < DECIDED:
-        return (
-            f"the errors do not decide how the covariance is defined ({said}): it is read as {frame}; "
-            f"{Hint('error_frame')} names another"
-        )
-    return f"the covariance is read as {frame} ({said}, found from the errors)"
-
-
 def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) -> Array:
     """Return covariances in the truth's body axes, with the uncertainty of the alignment added."""
     turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
@@ -347,20 +316,18 @@ def explanations(
     readings: Mapping[str, Array],
     frame: str,
     probabilities: Mapping[str, float],
-    truth: Truth,
-    own: Series,
+    derivatives: Array,
     *,
     confidence_level: float = 0.99,
 ) -> tuple[Explanation, ...]:
     """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
-    ``own`` is the aligned estimate. For a consistent filter none is likely with ``confidence_level``.
+    ``derivatives`` (m, 3, 7) are those of :func:`jacobian`. For a consistent filter none is likely with ``confidence_level``.
     """
-    P = readings[frame]
+    P = readings[frame][:, :3, :3]
     candidates = [
-        *_constant_differences(error, P[:, :3, :3], jacobian(own.time, own.attitude, truth)),
-        _wrong_scale(whitened(error, P[:, :3, :3])),
-        *_zero_bias(own, truth, P),
+        *_constant_differences(error, P, derivatives),
+        _wrong_scale(whitened(error, P)),
         *_other_frames(error, readings, frame, probabilities),
     ]
     likely = holm([candidate.p_value for candidate in candidates], 1.0 - confidence_level)
@@ -372,7 +339,7 @@ def explanations(
 
 
 def _constant_differences(error: Array, P: Array, derivatives: Array) -> Iterator[Explanation]:
-    """Yield constant rotations of the frames and a clock offset; ``derivatives`` (m, 3, 7) are those of the error with respect to them."""
+    """Yield constant rotations of the frames and a clock offset."""
     white, factor = whitened(error, P), np.linalg.cholesky(P)
     designs = {
         "fixed frame rotated (heading, gravity)": derivatives[:, :, :3],
@@ -398,16 +365,6 @@ def _wrong_scale(white: Array) -> Explanation:
     if average is not None and average.reliable:
         p_value = mean_p_value(average.mean, 3, average.effective, certainty=average.certainty)
     return Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value)
-
-
-def _zero_bias(own: Series, truth: Truth, P: Array) -> Iterator[Explanation]:
-    """Yield a gyro bias that the filter holds at zero, if the truth has one."""
-    if own.bias is None or own.bias.any() or not truth.has_bias:
-        return
-    rms = float(np.sqrt(np.mean(np.sum(truth.bias**2, axis=1))))
-    sigma = np.sqrt(float(np.mean(np.trace(P[:, 3:, 3:], axis1=1, axis2=2))))
-    value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
-    yield Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0)
 
 
 def _other_frames(

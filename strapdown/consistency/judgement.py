@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from strapdown.checks import Array, InputError, unit_quaternions
-from strapdown.consistency.accuracy import KINDS, accuracy
+from strapdown.consistency.accuracy import accuracy
 from strapdown.consistency.bounds import log_mean_bounds, mean_bounds, mean_p_value, tail
 from strapdown.consistency.manifold import SUBSETS, errors, nees
 from strapdown.consistency.timeaverage import time_average
@@ -45,16 +45,8 @@ DETECTABLE = 1.5
 
 STATES = ("attitude", "bias")
 """States of a filter whose σ are tested."""
-NO_TRUTH = "the truth is not known"
-"""Reason why a part of a result is not tested."""
-NO_COVARIANCE = "no covariance"
-"""Another one."""
-
-WITHOUT_TRUTH = (
-    "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
-    "nor a bias error that the initial state hides, such as the coning error of the integration"
-)
-"""A limit of a judgement."""
+NO_TRUTH, NO_COVARIANCE = "the truth is not known", "no covariance"
+"""Reasons why a part of a result is not tested."""
 
 _LEANINGS = {
     frozenset[bool](): "the filter's model does not hold",
@@ -313,12 +305,14 @@ def judge(
     untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], why)
     truth = estimate.truth if truth is None else truth
     if truth is None and findings:
-        limits.append(WITHOUT_TRUTH)
+        limits.append(
+            "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, nor a bias error "
+            "that the initial state hides, such as the coning error of the integration"
+        )
     elif truth is not None and estimate.has_covariance:
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
-        names = tuple(estimate.error_states)
-        limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: {NO_TRUTH}")
+        limits.append(f"the σ of {listed(tuple(estimate.error_states))} is not tested: {NO_TRUTH}")
     judged = concluded(
         _one_sided(findings) if estimate.motion else findings,
         limits,
@@ -339,20 +333,14 @@ def _one_sided(findings: Sequence[Finding]) -> list[Finding]:
 
 def _bounded(judged: Judgement, estimate: Estimate, truth: Truth | None) -> Judgement:
     """Return the verdict by one-sided tests of the ratios of a filter whose σ are upper bounds, and name these ratios."""
-    findings = tuple(replace(finding, low=0.0) for finding in judged.findings)
-    judged = replace(judged, findings=findings)
-    if judged.verdict == "not consistent" or not findings:
+    judged = replace(judged, findings=tuple(replace(finding, low=0.0) for finding in judged.findings))
+    if judged.verdict == "not consistent" or not judged.findings:
         return judged
-    sizes = [
-        f"innovations of {finding.of} {math.sqrt(finding.value):.2g}" for finding in findings if finding.name == "NIS"
-    ]
-    if truth is not None:
-        table = accuracy(estimate, truth)
-        sizes = [f"{kind} {table.rms_over_sigma[kind]:.2g}" for kind in KINDS if kind in table.rms_over_sigma] + sizes
-    words = (
-        f"σ are upper bounds, because the filter's noise covers lasting disturbances; RMS over σ: {', '.join(sizes)}"
-    )
-    return replace(judged, reason=f"{judged.reason} ({words})")
+    sizes = {} if truth is None else accuracy(estimate, truth).rms_over_sigma
+    sizes |= {f"{INNOVATIONS}{f.of}": math.sqrt(f.value) for f in judged.findings if f.name == "NIS"}
+    words = ", ".join(f"{name} {size:.2g}" for name, size in sizes.items())
+    reason = f"σ are upper bounds, because the filter's noise covers lasting disturbances; RMS over σ: {words}"
+    return replace(judged, reason=f"{judged.reason} ({reason})")
 
 
 def ratio(
@@ -423,18 +411,12 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
         return []
     attitude = unit_quaternions("truth.attitude", truth.attitude[has_truth])
     e = errors(estimate.attitude[has_truth], estimate.bias[has_truth], attitude, truth.bias[has_truth])
-    variance = estimate.variance[has_truth]
     # The filter or the reference may have no bias.
-    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
-    tested = STATES[: known // 3]
+    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(estimate.variance[has_truth, 3:]).any() else 3
+    untested |= dict.fromkeys(STATES[: known // 3], "no full covariances" if estimate.covariance is None else "")
     if estimate.covariance is None:
-        limits.append(
-            "the estimate holds variances only, so errors are judged axis by axis at the end; keep full covariances"
-        )
-        untested |= dict.fromkeys(tested, "no full covariances")
-        return [_largest_at_end(e[-1], variance[-1])]
+        return []
     e, P = e[:, :known], estimate.covariance[has_truth][:, :known, :known]
-    untested |= dict.fromkeys(tested, "")
     findings: list[Finding] = []
     for subset, states in SUBSETS.items():
         if max(states) >= known:
@@ -454,7 +436,11 @@ def _over_run(estimate: Estimate, subset: str, e: Array, P: Array) -> Finding | 
     """Return the finding on the errors of a subset of the states over the run, or the reason why they are not tested."""
     if len(e) < FEWEST_TO_AVERAGE:
         return "too few epochs with a truth"
-    if not (estimate.motion or _averages(subset, tuple(estimate.error_states))):
+    # The correlation is estimated from the six errors only. An error state adds a part that may last longer than the run; if that part
+    # happens to be small, the rest appears both fast and too small, and a consistent filter would be called pessimistic (20 % of single
+    # runs with states for flicker). Gyro states add such a part to the bias; only states of the sensors add one to the attitude.
+    of_sensors = [name for name in estimate.error_states if not name.startswith(("gyro ", "gyro."))]
+    if not estimate.motion and (of_sensors if subset == "attitude" else estimate.error_states):
         return "the correlation time of errors with further error states is not known from one run"
     states = SUBSETS[subset]
     average = time_average(e, P, states)
@@ -463,31 +449,6 @@ def _over_run(estimate: Estimate, subset: str, e: Array, P: Array) -> Finding | 
     size = (average.mean, len(states), average.effective)
     words = error_words(f"the {subset} error over the run", average.mean)
     return ratio("time-averaged NEES", subset, *size, words, average.certainty)
-
-
-def _largest_at_end(error: Array, variance: Array) -> Finding:
-    """Return the finding of the largest error at the end over the axes; its p-value includes their number (Bonferroni)."""
-    squares = (error**2 / variance)[np.isfinite(error)]
-    name = state_name(int(np.argmax(squares)))
-    ratio = math.sqrt(float(np.max(squares)))
-    return Finding(
-        name="error at the end",
-        of=name,
-        value=ratio,
-        p_value=min(1.0, len(squares) * min(mean_p_value(float(x), 1, 1) for x in squares)),
-        samples=1,
-        means=f"the {name} error at the end is {ratio:.3g} σ",
-    )
-
-
-def _averages(subset: str, beside: Sequence[str]) -> bool:
-    """Return whether the error of a subset of the states may be averaged over one run of a filter with these further error states.
-
-    The correlation is estimated from the six errors only. An error state adds a part that may last longer than the run; if that part
-    happens to be small, the rest appears both fast and too small, and a consistent filter would be called pessimistic (20 % of single
-    runs with states for flicker). Gyro states add such a part to the bias; only states of the sensors add one to the attitude.
-    """
-    return not beside or (subset == "attitude" and all(name.startswith(("gyro ", "gyro.")) for name in beside))
 
 
 def error_words(what: str, ratio: float) -> str:
@@ -558,10 +519,7 @@ def _verdict(
     rejected = [finding for finding in findings if finding.rejected]
     if rejected:
         leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
-        which = "the one test contradicts it"
-        if len(findings) > 1:
-            which = f"{len(rejected)} of {len(findings)} tests contradict{'s' if len(rejected) == 1 else ''} it"
-        return "not consistent", f"{leaning}; {which}"
+        return "not consistent", f"{leaning}; {len(rejected)} of {len(findings)} tests contradict it"
     if not findings:
         without = any(part.why == NO_COVARIANCE for part in parts)
         return "cannot tell", f"{NO_COVARIANCE if without else 'no innovation, and no truth'}: nothing to test"
