@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array
-from strapdown.covariance.consider import Consider, check_considered, checked_size
+from strapdown.checks import Array, non_negative
+from strapdown.covariance.consider import Consider, check_considered
 from strapdown.covariance.deterministic_errors import (
     MIN_ERROR,
     DeterministicError,
@@ -90,8 +90,8 @@ def analyse(
     check_considered(scenario, consider)
     attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
     bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
-    checked_size("initial_attitude_sigma", attitude_sigma, unit="rad")
-    checked_size("initial_bias_sigma", bias_sigma, unit="rad/s")
+    non_negative("initial_attitude_sigma", attitude_sigma, unit="rad")
+    non_negative("initial_bias_sigma", bias_sigma, unit="rad/s")
     path = trajectory_of(scenario, setup, epochs)
     fixed = fixed_errors(scenario, setup, path)
     considered = considered_errors(scenario, consider, path)
@@ -109,12 +109,16 @@ def analyse(
         fixed_errors=out.columns[:, real],
         considered=tuple(column.name for column in considered),
         considered_errors=out.columns[:, len(fixed) :],
-        expected_nis=_expected_nis(scenario, out.nis),
+        expected_nis={
+            sensor.name: float(total / degrees)
+            for sensor, (total, degrees) in zip(scenario.sensors, out.nis, strict=True)
+            if degrees > 0.0
+        },
         units_drawn=setup.states is not None and setup.states.has_constants,
         left_out=_left_out(scenario, setup),
-        beyond_linear=_beyond_linear(attitude_sigma, columns, sizes, consider),
+        beyond_linear=(),
     )
-    return dataclasses.replace(analysis, beyond_linear=(*analysis.beyond_linear, *_attitude_beyond_linear(analysis)))
+    return dataclasses.replace(analysis, beyond_linear=_beyond_linear(analysis, columns, sizes))
 
 
 def _fast_bias(setup: FilterSetup, epochs: int) -> Array:
@@ -124,12 +128,6 @@ def _fast_bias(setup: FilterSetup, epochs: int) -> Array:
         fast[:] = diagonal(0.0, setup.states.gyro_fast_bias_sigma)
         fast[0] *= -1.0  # the initial bias contains this part, so its error does not
     return fast
-
-
-def _expected_nis(scenario: Scenario, nis: Array) -> dict[str, float]:
-    """Return the mean NIS per degree of freedom by sensor, from its sum and the degrees of freedom (sensors, 2)."""
-    sums = zip(scenario.sensors, nis, strict=True)
-    return {sensor.name: float(total / degrees) for sensor, (total, degrees) in sums if degrees > 0.0}
 
 
 def _propagated(
@@ -216,14 +214,8 @@ def _measurements(events: Schedule) -> Measurements:
 def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     """Return the errors of a scenario, and the parts of a filter, that the analysis does not include."""
     spec = scenario.gyro
-    names = (
-        "quantization",
-        "rate_resolution",
-        "sampling_jitter",
-        "timestamp_error",
-        "timestamp_offset",
-        "drop_probability",
-    )
+    timing = ("sampling_jitter", "timestamp_error", "timestamp_offset", "drop_probability")
+    names = ("quantization", "rate_resolution", *timing)
     terms = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
     if spec.temperature is not None:
         terms.append("gyro bias over temperature")
@@ -233,29 +225,15 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     return tuple(terms)
 
 
-def _beyond_linear(
-    attitude_sigma: float, columns: list[DeterministicError], sizes: Sequence[float], consider: Consider
-) -> tuple[str, ...]:
+def _beyond_linear(analysis: Analysis, columns: list[DeterministicError], sizes: Sequence[float]) -> tuple[str, ...]:
     """Return the errors that are too large for the analysis, in words; ``sizes``: the largest error of a sensor by column, rad."""
-    terms = []
-    if attitude_sigma > LARGEST_LINEAR:
-        terms.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
-    if consider.scale_factor > LARGEST_LINEAR:
-        terms.append(f"scale factor, 1σ {100.0 * consider.scale_factor:.3g} %")
-    if consider.misalignment > LARGEST_LINEAR:
-        terms.append(f"misalignment, 1σ {consider.misalignment / DEGREE:.3g}°")
     largest: dict[str, float] = {}
     for column, size in zip(columns, sizes, strict=True):
         name = column.name.partition(",")[0]  # the largest over the axes of a considered error
         largest[name] = max(largest.get(name, 0.0), size)
-    large = (f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR)
-    return (*terms, *large)
-
-
-def _attitude_beyond_linear(analysis: Analysis) -> list[str]:
-    """Return in words the largest attitude error, if it is too large for the analysis."""
-    errors = analysis.rms[:, :3].max(axis=1)
-    epoch = int(np.argmax(errors))
-    if errors[epoch] <= LARGEST_LINEAR:
-        return []
-    return [f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {analysis.time[epoch]:.6g} s"]
+    terms = [f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR]
+    attitude = analysis.rms[:, :3].max(axis=1)
+    if (error := attitude.max()) > LARGEST_LINEAR:
+        time = analysis.time[np.argmax(attitude)]
+        terms.append(f"the attitude error itself, {error / DEGREE:.3g}° at {time:.6g} s")
+    return tuple(terms)

@@ -26,6 +26,7 @@ from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
 from strapdown.vectors import VectorMeasurements
+from strapdown.vectors.sensor import Sampled
 
 
 class Trajectory(NamedTuple):
@@ -94,15 +95,7 @@ def _observed(scenario: Scenario) -> list[VectorMeasurements]:
     start, end = scenario.edges[0], scenario.edges[-1]
     observed = []
     for sensor in scenario.sensors:
-        kinds = (
-            vectors.VectorSensor,
-            vectors.AttitudeSensor,
-            vectors.Magnetometer,
-            vectors.Accelerometer,
-            vectors.HeadingPair,
-            vectors.HorizonSensor,
-        )
-        if not isinstance(sensor, kinds):
+        if not isinstance(sensor, Sampled):
             raise InputError(
                 f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not support; remove it"
             )
