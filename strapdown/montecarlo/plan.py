@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import json
@@ -21,11 +20,12 @@ from strapdown.files import tables
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import Origin
+from strapdown.results import ByValue
 from strapdown.scenarios import Scenario
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Dispersions:
+class Dispersions(ByValue):
     """Independent normal dispersions between runs besides the noise. Default: initial errors from the filter's prior.
 
     Parameters
@@ -116,12 +116,11 @@ _FORM: tables.Form = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plan:
+class Plan(ByValue):
     """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
     Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.estimation.setup.FilterSetup.for_scenario` is a mismatched
-    filter. Outages, outliers and correlated noise are properties of the scenario's sensors. Plans are equal if their tables are, so a
-    machine may cache data derived from one in a ``weakref.WeakKeyDictionary``.
+    filter. Outages, outliers and correlated noise are properties of the scenario's sensors.
 
     Parameters
     ----------
@@ -163,18 +162,6 @@ class Plan:
                 f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
                 f"a duration whose sample count is a multiple of {self.epochs * self.setup.integration.samples}, or other epochs"
             )
-
-    def __eq__(self, other: object) -> bool:
-        """Compare the tables; plans of user-defined motions, which have none, are equal only to themselves."""
-        if not isinstance(other, Plan):
-            return NotImplemented
-        with contextlib.suppress(InputError):
-            return self is other or self.digest == other.digest
-        return False
-
-    def __hash__(self) -> int:
-        """Return a hash that equal plans share."""
-        return hash((self.seed, self.epochs, self.nis_bins))
 
     @property
     def samples(self) -> int:
