@@ -34,8 +34,18 @@ def go(path, runs, plan=PLAN, **options):
 
 
 @cache
-def straight(runs, chunk=CHUNK):
-    return montecarlo.run_plan(PLAN, runs=runs, chunk=chunk, threads=1, machine="scalar")
+def straight(runs):
+    return montecarlo.run_plan(PLAN, runs=runs, chunk=CHUNK, threads=1, machine="scalar")
+
+
+def noting(computed):
+    """Workers in this thread, and a list of the chunks that they compute."""
+
+    def workers(work, chunks):
+        computed.extend(chunks)
+        return map(work, *zip(*computed, strict=True)) if computed else iter(())
+
+    return workers
 
 
 # ------------------------------------------------------------------------------------------------------------ the file
@@ -80,26 +90,16 @@ def test_a_campaign_runs_in_any_thread(tmp_path):
 
 def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path):
     """From ends on whole chunks and on short ones, of which only the short one is computed again; at its end nothing is."""
-    path, computed, reported = tmp_path / "c.h5", [], []
-
-    def noting(work, chunks):
-        computed.extend(chunks)
-        return map(work, *zip(*computed, strict=True))
-
+    path, computed, nothing, reported = tmp_path / "c.h5", [], [], []
     go(path, 5)
     for end in (8, 13):
         go(path, end, resume=True, chunk=None)
-    result = go(path, 30, resume=True, workers=noting)
+    result = go(path, 30, resume=True, workers=noting(computed))
     assert computed == list(engine.chunks_of(30, CHUNK))[1:]
     assert_same(result.statistics, straight(30))
     assert_same(campaign.read(path).statistics, straight(30))
-
-    def idle(work, chunks):
-        assert not list(chunks)
-        return iter(())
-
-    again = go(path, 30, resume=True, workers=idle, progress=reported.append)
-    assert reported == [30]
+    again = go(path, 30, resume=True, workers=noting(nothing), progress=reported.append)
+    assert (nothing, reported) == ([], [30])
     assert_same(result.statistics, again.statistics)
     assert again.seconds >= result.seconds
 
@@ -119,12 +119,7 @@ def test_finished_chunks_are_not_computed_again(tmp_path, stop):
     held = campaign.read(path)
     assert held.finished_runs == stop * CHUNK
     assert not held.finished
-
-    def noting(work, chunks):
-        computed.extend(chunks)
-        return map(work, *zip(*computed, strict=True))
-
-    result = go(path, 29, resume=True, workers=noting)
+    result = go(path, 29, resume=True, workers=noting(computed))
     assert computed == list(engine.chunks_of(29, CHUNK))[stop:]
     assert_same(result.statistics, straight(29))
 
@@ -149,76 +144,36 @@ def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
 # ------------------------------------------------------------------------------------------------------------ killed
 
 
-def _child(path, runs, chunk, die_at):
-    """Run a campaign in a forked process; with ``die_at`` it kills itself in the middle of writing its n-th dataset."""
-    if die_at:
-        written = [0]
-        original = campaign.put
+def _killed(path, runs, die_at):
+    """Resume a campaign in a forked process that kills itself in the middle of writing its n-th dataset."""
+    written, original = [], campaign.put
 
-        def put(*arguments):
-            written[0] += 1
-            if written[0] == die_at:
-                os.kill(os.getpid(), signal.SIGKILL)
-            original(*arguments)
+    def put(*arguments):
+        written.append(arguments)
+        if len(written) == die_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        original(*arguments)
 
-        campaign.put = put
-    original_chunks = scalar.run_chunks
-
-    def unhurried(*arguments):  # so that even a fast machine is killed twice before it is through
-        time.sleep(0.02)
-        return original_chunks(*arguments)
-
-    scalar.run_chunks = unhurried
-    go(path, runs, resume=True, chunk=chunk, threads=1)
-
-
-def _killed(path, runs, *, chunk=CHUNK, after=None, die_at=0):
-    """Start such a process, kill it after so many seconds if it has not finished; return whether it was killed."""
-    child = multiprocessing.get_context("fork").Process(target=_child, args=(path, runs, chunk, die_at))
-    child.start()
-    child.join(after)
-    if child.is_alive():
-        os.kill(child.pid, signal.SIGKILL)
-    child.join()
-    return child.exitcode == -signal.SIGKILL
-
-
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
-    scalar.run_chunk(PLAN, 0, 1)  # compiled before the children fork
-    path = tmp_path / "c.h5"
-    runs, chunk, kills, total, folds = 40, 4, 0, None, {}
-    for first, number in engine.chunks_of(runs, chunk):
-        part = scalar.run_chunk(PLAN, first, number)
-        total = part if total is None else statistics.merge(total, part)
-        folds[total.runs] = total
-    random = np.random.default_rng(8)
-    for _ in range(10):
-        if not _killed(path, runs, chunk=chunk, after=random.uniform(0.02, 0.15)):
-            break
-        kills += 1
-        if path.exists():
-            held = campaign.read(path)  # whole at every moment
-            if held.statistics is not None:
-                assert_same(held.statistics, folds[held.statistics.runs])
-    _killed(path, runs, chunk=chunk)
-    assert kills >= 2
-    assert_same(campaign.read(path).statistics, total)
-    assert [p.name for p in tmp_path.iterdir()] == ["c.h5"]  # nothing of the killed ones is left
+    campaign.put = put
+    go(path, runs, resume=True, threads=1)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 @pytest.mark.parametrize("die_at", [18, 31])
 def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, die_at):
-    scalar.run_chunk(PLAN, 0, 1)
+    scalar.run_chunk(PLAN, 0, 1)  # compiled before the child forks
     path = tmp_path / "c.h5"
     go(path, 16)
     before = path.read_bytes()
-    assert _killed(path, 24, die_at=die_at)
+    child = multiprocessing.get_context("fork").Process(target=_killed, args=(path, 24, die_at))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
     if die_at <= 18:  # the first writing of the resumed campaign
         assert path.read_bytes() == before
     assert campaign.read(path).statistics.runs >= 16
     assert_same(go(path, 24, resume=True).statistics, straight(24))
+    assert [p.name for p in tmp_path.iterdir()] == ["c.h5"]  # nothing of the killed one is left
 
 
 # ------------------------------------------------------------------------------------------------------------ refused
@@ -395,8 +350,12 @@ def test_the_command_resumes_extends_and_shows(command):
 
 def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(command):
     """Scale factors over the runs: independent standard normals times that of the specification, whatever the chunks."""
+    Path("f.toml").write_text(setups.to_toml(setups.FilterSetup.for_scenario(SCENARIO, states=True)))
+    _, said, _ = command("short.toml", "--runs", 4, "--filter", "f.toml", "--out", "by-file.h5", *SCALAR)
+    assert "Each run draws its own gyro" in said
     command("short.toml", "--runs", 4, "--states", *SCALAR)
     plan = campaign.read("short-montecarlo.h5").plan
+    assert plan == campaign.read("by-file.h5").plan
     assert plan.individuals
     assert plan.setup.states.names == ("gyro.scale",)
     known = replace(SCENARIO.gyro, scale_factor=np.zeros(3))
@@ -410,13 +369,6 @@ def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(
         ratio.append((flawed - perfect).sum(axis=0)[k] / turn[k] / SCENARIO.gyro.scale_factor[k])
     assert abs(np.mean(ratio)) < 3.5 / np.sqrt(40)
     assert 0.65 < np.std(ratio) < 1.4
-
-
-def test_it_also_does_so_if_the_filter_with_the_states_is_in_a_file(command):
-    Path("f.toml").write_text(setups.to_toml(setups.FilterSetup.for_scenario(SCENARIO, states=True)))
-    _, said, _ = command("short.toml", "--runs", 4, "--filter", "f.toml", *SCALAR)
-    assert "Each run draws its own gyro" in said
-    assert campaign.read("short-montecarlo.h5").plan.individuals
 
 
 def test_a_file_in_which_no_run_was_finished_does_not_stand_in_the_way(tmp_path):
@@ -523,18 +475,17 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
     assert campaign.read("short-montecarlo.h5").statistics.runs == 2 * scalar.CHUNK
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(command, heeded, monkeypatch, number):
+def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(command, heeded, monkeypatch):
     """As a shell has SIGINT ignored for what it starts in the background, and nohup SIGHUP."""
     original = campaign._write
 
     def interrupted(*arguments):
-        signal.raise_signal(number)
+        signal.raise_signal(signal.SIGTERM)
         original(*arguments)
 
-    signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     monkeypatch.setattr(campaign, "_write", interrupted)
     status, _, _ = command("short.toml", "--runs", 4, "--threads", 1, *SCALAR)
     assert status == 3  # 4 runs cannot tell
     assert campaign.read("short-montecarlo.h5").finished
-    assert signal.getsignal(number) is signal.SIG_IGN
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN

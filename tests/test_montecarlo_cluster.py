@@ -1,17 +1,14 @@
 """Chunks on Dask: the bits of one process, whoever computes them and whoever is killed meanwhile."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import pytest
 from spin_plan import PLAN, SCENARIO, assert_same
 
-import strapdown
 from strapdown import cli, montecarlo
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
@@ -76,11 +73,19 @@ def test_an_error_on_a_worker_comes_out(client):
 
 @pytest.mark.parametrize(("name", "value"), [("version", "0.0.1"), ("sources", "0123"), ("arithmetic", "no FMA")])
 def test_a_worker_of_another_version_edit_or_rounding_is_refused(client, monkeypatch, name, value):
-    wanted = engine.identity()._replace(**{name: value})
-    monkeypatch.setattr(cluster, "identity", iter([wanted, engine.identity()]).__next__)  # here, then on the worker
-    monkeypatch.setattr(cluster, "_work", lambda payload: pytest.fail("unpacked"))
-    message = f"a worker has another {name} of strapdown, .*, than the process that uses it, {value}, and may"
+    here = engine.identity()
+    wanted = here._replace(**{name: value})
+    message = (
+        f"a worker has another {name} of strapdown, {getattr(here, name)}, than the process that uses it, {value}, "
+    )
     with pytest.raises(InputError, match=message):
+        cluster._chunk(b"is not unpacked", 0, 2, wanted)
+
+    def sent(payload, first, runs, identity):
+        raise InputError(f"{identity == here}")
+
+    monkeypatch.setattr(cluster, "_chunk", sent)
+    with pytest.raises(InputError, match="True"):
         montecarlo.run_plan(PLAN, runs=2, chunk=2, machine="scalar", workers=cluster.on_dask(client))
 
 
@@ -125,42 +130,6 @@ def test_a_scheduler_that_is_killed_ends_the_campaign_with_one_line(tmp_path, mo
         process.wait()
 
 
-@pytest.fixture
-def certificates(tmp_path):
-    """Dask's configuration for a certificate that is signed by itself."""
-    if shutil.which("openssl") is None:
-        pytest.skip("no openssl on this machine, which makes the certificate")
-    key, certificate = (str(tmp_path / name) for name in ("key.pem", "certificate.pem"))
-    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
-    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
-    pair = {"key": key, "cert": certificate}
-    return {f"distributed.comm.tls.{name}": value for name, value in (
-        ("ca-file", certificate), *((f"{who}.{part}", file) for who in ("client", "scheduler", "worker") for part, file in pair.items())
-    )}  # fmt: skip
-
-
-def test_an_encrypted_scheduler_is_reached_with_the_certificates_of_dask(certificates, monkeypatch):
-    """The configuration passes through; without it, or without encryption, nobody gets in."""
-    dask = pytest.importorskip("dask")
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 5)
-    with dask.config.set(certificates), distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs="CRITICAL", protocol="tls://",
-        security=distributed.Security(require_encryption=True), host="127.0.0.1",
-    ) as local:  # fmt: skip
-        address = local.scheduler_address
-        assert address.startswith("tls://127.0.0.1:")
-        with cluster.dask_client(address=address) as here:
-            statistics = montecarlo.run_plan(PLAN, runs=8, chunk=4, machine="scalar", workers=cluster.on_dask(here))
-        assert_same(statistics, alone(8, 4))
-        with dask.config.set(dict.fromkeys(certificates)):
-            for wrong in (address, address.replace("tls://", "tcp://")):
-                with (
-                    pytest.raises(InputError, match=f"no Dask scheduler answers at {wrong}"),
-                    cluster.dask_client(address=wrong),
-                ):
-                    pass
-
-
 def test_the_help_says_what_trust_a_scheduler_takes(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", "--help"])
     with pytest.raises(SystemExit):
@@ -202,50 +171,24 @@ def test_worker_processes_give_the_bits_of_one_process(workers, machine):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_only_its_chunk(tmp_path):
-    """Two worker processes without a nurse; one is killed by its pid in the middle, the campaign ends in the same bits."""
+def test_a_killed_worker_costs_only_its_chunk():
+    """One of two worker processes is killed in the middle; the campaign ends in the same bits."""
     longer = replace(SCENARIO, duration=60.0)
     plan = montecarlo.Plan(
         scenario=longer, setup=setups.FilterSetup.for_scenario(longer, states=False), seed=4, epochs=6, nis_bins=5
     )
-    address, workers = tmp_path / "scheduler.json", []
-    dask = [sys.executable, "-m", "dask"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
-    scheduler = subprocess.Popen(
-        [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", address],
-        **quiet,
-    )
-    try:
-        workers = [
-            subprocess.Popen(
-                [*dask, "worker", "--scheduler-file", address, "--no-nanny", "--nthreads", "1", "--no-dashboard"],
-                **quiet,
-            )
-            for _ in range(2)
-        ]
-        with distributed.Client(scheduler_file=address, timeout=60, set_as_default=False) as here:
-            here.wait_for_workers(2, timeout=60)
-            where = here.scheduler.address
-        computed, killed = [], []
+    with cluster.dask_client(workers=2) as client:
+        pid, *_ = client.run(os.getpid).values()
+        computed = []
 
         def progress(runs):
             computed.append(runs)
             if len(computed) == 10:
-                os.kill(workers[0].pid, signal.SIGKILL)
-                killed.append(time.monotonic())
+                os.kill(pid, signal.SIGKILL)
 
-        with cluster.dask_client(address=where) as here:
-            assert len(here.nthreads()) == 2
-            statistics = montecarlo.run_plan(
-                plan, runs=160, chunk=4, machine="scalar", workers=cluster.on_dask(here), progress=progress
-            )
-            assert len(here.nthreads()) == 1
-        assert killed
-        assert workers[0].wait(timeout=10) == -signal.SIGKILL
-        assert len(computed) == 40  # every chunk came once
-    finally:
-        for process in (*workers, scheduler):
-            process.kill()
-            process.wait()
+        statistics = montecarlo.run_plan(
+            plan, runs=160, chunk=4, machine="scalar", workers=cluster.on_dask(client), progress=progress
+        )
+        assert pid not in client.run(os.getpid).values()
+    assert len(computed) == 40  # every chunk came once
     assert_same(statistics, alone(160, 4, plan))
-    assert strapdown.__version__
