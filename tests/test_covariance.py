@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import chi2, norm
-from typer.testing import CliRunner
 
-from strapdown import cli, coning, consistency, covariance, montecarlo, motion, quaternion, vectors
+from strapdown import coning, consistency, covariance, montecarlo, motion, quaternion, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
+from strapdown.covariance.consider import considered as considered_errors
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
@@ -767,17 +767,19 @@ def test_only_an_error_that_is_drawn_in_every_run_is_said_to_average_out():
 
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     options = ("--epochs", 10, "--consider", "misalignment=0.1", "--consider", "star.delay=2")
+    matched = setup.FilterSetup.for_scenario(load_scenario("spin"), states=False)
+    (tmp_path / "filter.toml").write_text(setup.to_toml(matched), encoding="utf-8")
+    assert succeeds("covariance", "spin", "--filter", "filter.toml", "--out", "by-file", *options)
+    by_file = (tmp_path / "by-file" / "covariance.json").read_text(encoding="utf-8")
     said = succeeds("covariance", "spin", "--no-states", *options)
     assert "The filter has no state for the gyro's scale factor" in said
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
     saved = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
+    assert saved == json.loads(by_file)
     assert len(saved["time_s"]) == 11
     direct = covariance.analyse(
-        load_scenario("spin"),
-        setup.FilterSetup.for_scenario(load_scenario("spin"), states=False),
-        consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}),
-        epochs=10,
+        load_scenario("spin"), matched, consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}), epochs=10
     )
     assert np.allclose(np.array(saved["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
     assert np.allclose(np.array(saved["rms"]["bias_deg_per_hour"]) * DEGREE / 3600.0, direct.rms[:, 3:])
@@ -801,34 +803,18 @@ def test_the_command_refuses_in_one_line(run):
         assert status == 2
 
 
-def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch, tmp_path):
-    class Reached(Exception):  # noqa: N818
-        pass
-
-    def analysed(scenario, belief, **options):
-        raise Reached(belief, options.pop("consider"), options)
-
-    monkeypatch.setattr("strapdown.covariance_analysis", analysed, raising=False)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "filter.toml").write_text(setup.to_toml(BELIEF), encoding="utf-8")
-
-    def reached(scenario, *considered):
-        options = [f"--consider={error}" for error in considered]
-        arguments = ["covariance", scenario, "--filter", "filter.toml", *options]
-        result = CliRunner().invoke(cli.app, arguments)
-        assert isinstance(result.exception, Reached), result.output
-        return result.exception.args
-
-    errors = ("scale_factor=3", "misalignment=2", "g_sensitivity=7", "star.bias=4", "star.mounting=5", "star.delay=6")
-    belief, consider, _ = reached("spin", *errors)
-    assert belief == BELIEF
+def test_considered_errors_are_in_the_units_of_a_data_sheet():
+    gyro = {"scale_factor": 3.0, "misalignment": 2.0, "g_sensitivity": 7.0}
+    star = {"star.bias": 4.0, "star.mounting": 5.0, "star.delay": 6.0}
+    (consider,) = considered_errors(gyro | star, load_scenario("spin").sensors).values()
     assert consider.scale_factor == pytest.approx(3e-6)
     assert consider.misalignment == pytest.approx(2e-3)
+    assert consider.g_sensitivity == pytest.approx(7.0 * np.pi / 180.0 / 3600.0 / 9.80665, rel=1e-12)  # rad/s per m/s²
     assert consider.sensor_bias == {"star": pytest.approx(4.0 * ARCSECOND)}
     assert consider.mounting == {"star": pytest.approx(5.0 * ARCSECOND)}
     assert consider.time_offset == {"star": pytest.approx(6e-3)}
-    assert consider.g_sensitivity == pytest.approx(7.0 * np.pi / 180.0 / 3600.0 / 9.80665, rel=1e-12)  # rad/s per m/s²
-    _, consider, options = reached("low-orbit", "magnetometer.bias=100", "initial.attitude=2", "initial.bias=30")
-    assert consider.sensor_bias == {"magnetometer": pytest.approx(100e-9)}
-    assert options["initial_attitude_sigma"] == pytest.approx(2.0 * DEGREE)
-    assert options["initial_bias_sigma"] == pytest.approx(30.0 * DEGREE / 3600.0)
+    errors = {"magnetometer.bias": 100.0, "initial.attitude": 2.0, "initial.bias": 30.0}
+    options = considered_errors(errors, load_scenario("low-orbit").sensors)
+    assert options.pop("consider").sensor_bias == {"magnetometer": pytest.approx(100e-9)}
+    initial = {"initial_attitude_sigma": 2.0 * DEGREE, "initial_bias_sigma": 30.0 * DEGREE / 3600.0}
+    assert options == pytest.approx(initial)

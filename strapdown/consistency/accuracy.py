@@ -199,21 +199,9 @@ class Accuracy(Listed):
 
 
 def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = False) -> Accuracy:
-    """Return the attitude errors of an estimate against a truth at its times.
+    """Return the attitude errors of an estimate against a truth at its times, NaN where unknown; by default its own.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Estimate; with covariances, coverage and RMS over σ are reported too.
-    truth : Truth, optional
-        Attitudes at the estimate's times, NaN where unknown. Default: those of the estimate.
-    align : bool, default False
-        Whether to report the errors after clocks and frames are aligned too.
-
-    Returns
-    -------
-    Accuracy
-        Errors over all samples with a truth, and over the movement if the truth states it.
+    With ``align`` they are also reported after clocks and frames are aligned.
     """
     truth = estimate.truth if truth is None else truth
     if truth is None:

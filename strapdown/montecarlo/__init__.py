@@ -13,12 +13,10 @@ order, so the statistics do not depend on the number of threads, processes or ho
 - ``coning_study``: Integration error and consistency of the filter in coning motion: the command ``strapdown coning``.
 """
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
 from strapdown.estimation.setup import FilterSetup as FilterSetup
+from strapdown.montecarlo import campaign as campaign
+from strapdown.montecarlo import cluster as cluster
+from strapdown.montecarlo import coning_study as coning_study
 from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import replay, run, run_plan
 from strapdown.montecarlo.plan import Dispersions, Plan
@@ -30,23 +28,4 @@ from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import merge as merge
 from strapdown.montecarlo.verdicts import summary
 
-__all__ = [
-    "Dispersions",
-    "Plan",
-    "Statistics",
-    "replay",
-    "run",
-    "run_plan",
-    "summary",
-]
-
-if TYPE_CHECKING:
-    from strapdown.montecarlo import campaign as campaign
-    from strapdown.montecarlo import cluster as cluster
-    from strapdown.montecarlo import coning_study as coning_study
-
-
-def __getattr__(name: str) -> Any:
-    if name in ("campaign", "cluster", "coning_study"):  # imported on first use, for HDF5 and Dask
-        return import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__all__ = ["Dispersions", "Plan", "Statistics", "replay", "run", "run_plan", "summary"]

@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, montecarlo, quaternion
+from strapdown import coning, quaternion
 from strapdown.checks import InputError, count, positive
 from strapdown.consistency import Judgement
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo import FilterSetup, Statistics
-from strapdown.montecarlo.statistics import SUBSETS, Counts
+from strapdown.montecarlo import engine
+from strapdown.montecarlo.statistics import SUBSETS, Counts, Statistics
 from strapdown.motion import Coning
 from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario
@@ -423,7 +424,7 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     noise = ProcessNoise(angle_random_walk=ANGLE_RANDOM_WALK, rate_random_walk=RATE_RANDOM_WALK)
     base = FilterSetup(process_noise=noise, attitude_sigma=ATTITUDE_SIGMA, bias_sigma=BIAS_SIGMA)
     setups = [replace(base, integration=algorithm) for algorithm in algorithms]
-    statistics = montecarlo.run(
+    statistics = engine.run(
         parameters.scenario, setups, runs=parameters.runs, seed=parameters.seed, epochs=EPOCHS, progress=progress
     )
     outcomes = tuple(

@@ -264,8 +264,8 @@ def run(
     seed: int,
     epochs: int = 100,
     nis_bins: int = 100,
-    threads: int | None = None,
     machine: str = "scalar",
+    threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Statistics]:
     """Run several filter setups on the same simulated runs and return the statistics of each.

@@ -310,12 +310,8 @@ def scenario_to_toml(scenario: Scenario) -> str:
 
 def as_scenario(scenario: Scenario | str | os.PathLike[str]) -> Scenario:
     """Return a scenario from a Scenario, a built-in name, or the path of its TOML file."""
-    instance(
-        "scenario",
-        scenario,
-        (Scenario, str, os.PathLike),
-        "give a Scenario, a built-in name, or the path of a TOML file",
-    )
+    remedy = "give a Scenario, a built-in name, or the path of a TOML file"
+    instance("scenario", scenario, (Scenario, str, os.PathLike), remedy)
     return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
@@ -325,21 +321,6 @@ def _builtin_path(name: str) -> Path:
 
 def builtin_toml(name: str) -> str:
     """Return the TOML file of a built-in scenario, with its comments, as a template of your own.
-
-    Parameters
-    ----------
-    name : str
-        A name of :data:`SCENARIOS`.
-
-    Returns
-    -------
-    str
-        Text of the file.
-
-    Raises
-    ------
-    InputError
-        If the name is not known.
 
     Examples
     --------
