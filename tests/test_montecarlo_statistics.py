@@ -21,9 +21,7 @@ from strapdown.montecarlo import engine, plan, scalar, statistics
 from strapdown.montecarlo.coning_study import FilterOutcome
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 
-
-def planned(**changes):
-    return replace(PLAN, **changes)
+planned = functools.partial(replace, PLAN)
 
 
 # ------------------------------------------------------------------------------------------------------------ histogram
@@ -294,10 +292,13 @@ def test_an_anees_is_outside_its_bounds_where_holm_is_sharper_than_bonferroni():
 def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound(monkeypatch):
     monkeypatch.setattr(statistics.Statistics, "judged_epochs", np.array([2, 4]))
     sums = scalar.run_chunk(PLAN, 0, 8)
-    refused = np.arange(10).reshape(2, 5)
+    refused, coverage = np.arange(10).reshape(2, 5), np.zeros((7, 6, 3), int)
+    coverage[4], coverage[2, :3, 1] = 8, 8
     bound = np.tile(np.diag([4.0, 1.0, 1.0, 1.0, 1.0, 1.0]), (7, 1, 1))
-    summary = montecarlo.summary(replace(sums, sensor_refused=refused), bound=bound)
+    summary = montecarlo.summary(replace(sums, sensor_refused=refused, coverage=coverage), bound=bound)
     assert list(summary["refused"].values()) == [10, 35]
+    assert summary["coverage"]["attitude"] == [0.5, 1.0, 0.5]
+    assert summary["coverage"]["bias"] == [0.5, 0.5, 0.5]
     assert summary["anees"]["bias"] == pytest.approx(sums.anees[[2, 4], 2].mean())
     median = sums.error_quantile(0.5)[-1] * 648000.0 / np.pi
     np.testing.assert_allclose(summary["last_epoch"]["attitude_error_quantile_0.5_arcsec"], median[:3])
@@ -325,15 +326,6 @@ def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs(monkey
         assert summary[name] == pytest.approx(np.mean(total) / degrees)
         ends = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
         np.testing.assert_allclose(summary[f"{name}_bounds"], ends)
-
-
-def test_summary_takes_coverage_over_the_judged_epochs():
-    counts = np.zeros((PLAN.epochs + 1, 6, 3), int)
-    counts[4], counts[2, :3, 1] = 3, 3
-    sums = replace(scalar.run_chunk(PLAN, 0, 3), coverage=counts)
-    coverage = montecarlo.summary(sums)["coverage"]  # over six epochs, without the first
-    assert coverage["attitude"] == pytest.approx([1.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0])
-    assert coverage["bias"] == pytest.approx([1.0 / 6.0] * 3)
 
 
 # ------------------------------------------------------------------------------------------------------------ plans
