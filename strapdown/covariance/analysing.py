@@ -180,18 +180,14 @@ def _propagated(
 
 def _for_kernel(path: Trajectory, columns: Sequence[DeterministicError], fixed: int, n: int) -> analysis.Columns:
     """Return the deterministic errors for the kernel, for n states."""
-    with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
-    place = np.full(len(columns), -1)
-    place[with_rate] = np.arange(len(with_rate))
-    rate = np.zeros((len(path.dt), len(with_rate), 3))
+    rates = {k: column.rate for k, column in enumerate(columns) if column.rate is not None}
+    place, rate = np.full(len(columns), -1), np.zeros((len(path.dt), len(rates), 3))
+    for r, (k, values) in enumerate(rates.items()):
+        place[k], rate[:, r] = r, values
     turn, offset = np.zeros((2, len(path.events.time), len(columns), 3))
     for k, column in enumerate(columns):
-        if column.rate is not None:
-            rate[:, place[k]] = column.rate
-        if column.turn is not None:
-            turn[:, k] = column.turn
-        if column.offset is not None:
-            offset[:, k] = column.offset
+        turn[:, k] = 0.0 if column.turn is None else column.turn
+        offset[:, k] = 0.0 if column.offset is None else column.offset
     return analysis.Columns(
         rate=rate,
         place=place,
