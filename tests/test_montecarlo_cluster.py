@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import CancelledError
 from dataclasses import replace
 
 import pytest
@@ -104,6 +105,11 @@ def test_a_scheduler_without_workers_is_refused_and_not_waited_for(monkeypatch):
         pytest.raises(InputError, match=r"the scheduler at tcp://\S+ has no workers; start some, `dask worker tcp://"),
     ):
         montecarlo.run_plan(PLAN, runs=2, chunk=2, machine="scalar", workers=cluster.on_dask(here))
+
+
+def test_the_reason_of_a_lost_scheduler_is_one_line(client):
+    error = cluster._lost(client, CancelledError("cancelled for reason: connection-lost.\nClient lost the connection."))
+    assert "(cancelled for reason: connection-lost. Client lost the connection.)" in str(error)
 
 
 def test_a_scheduler_that_is_killed_ends_the_campaign_with_one_line(tmp_path, monkeypatch):

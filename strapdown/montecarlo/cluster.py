@@ -135,9 +135,10 @@ def _need_workers(client: Any, distributed: Any) -> None:
 
 
 def _lost(client: Any, error: object) -> InputError:
+    reason = " ".join(str(error).split()) or type(error).__name__
     return InputError(
-        f"the scheduler at {client.scheduler.address} was lost ({error or type(error).__name__}); what was finished is kept: start it "
-        "again and continue the campaign"
+        f"the scheduler at {client.scheduler.address} was lost ({reason}); what was finished is kept: start it again and continue the "
+        "campaign"
     )
 
 
