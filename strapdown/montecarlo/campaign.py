@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-import strapdown
 from strapdown import scenarios
 from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.consistency import Judgement
@@ -58,20 +57,14 @@ class Campaign(Listed):
         Scenario, filter and seed of the campaign.
     machine : {"lanes", "scalar"}
         Machine that computes the runs.
-    reason : str
-        Why the lanes cannot compute it; empty if they do, or if the machine was chosen by name.
     chunk : int
         Number of runs per chunk.
     runs : int
         Total number of runs.
     statistics : Statistics or None
         Statistics of the finished runs, from the first; None if there are none.
-    version : str, optional
-        Version of this package that computed it. Default: the running one.
-    sources : str, default ""
-        Digest of the sources of this package that computed it.
-    arithmetic : str, default ""
-        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`).
+    identity : Identity, optional
+        Version and sources of this package that computed it, and the processor's arithmetic. Default: those of this process.
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
     whole : Statistics, optional
@@ -80,13 +73,10 @@ class Campaign(Listed):
 
     plan: Plan
     machine: str
-    reason: str
     chunk: int
     runs: int
     statistics: Statistics | None
-    version: str = strapdown.__version__
-    sources: str = ""
-    arithmetic: str = ""
+    identity: Identity = field(default_factory=identity)
     seconds: float = 0.0
     whole: Statistics | None = field(default=None, repr=False)
 
@@ -114,9 +104,9 @@ class Campaign(Listed):
             "plan": self.plan.to_table(),
             "digest": self.plan.digest,
             "machine": self.machine,
-            "reason_for_scalar_engine": self.reason or None,
+            "reason_for_scalar_engine": choose(self.plan).reason or None,
             "chunk": self.chunk,
-            "version": self.version,
+            "version": self.identity.version,
             "seconds": self.seconds,
             **({} if statistics is None else verdicts.summary(statistics, judgement=judgement, bound=bound)),
         }
@@ -214,22 +204,20 @@ def run(
     """
     target = Path(path)
     count("runs", runs)
-    engine = choose(plan, machine)
+    name = choose(plan, machine).machine
     with locked(target), _sigterm_as_ctrl_c():
         if not resume and not overwrite and _would_lose(target):
             raise InputError(
                 f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
             )
         held = read(target) if resume and target.exists() else None
-        default = MACHINES[engine.machine].CHUNK if held is None else held.chunk
+        default = MACHINES[name].CHUNK if held is None else held.chunk
         start = Campaign(
             plan=plan,
-            machine=engine.machine,
-            reason=engine.reason,
+            machine=name,
             chunk=default if chunk is None else count("chunk", chunk),
             runs=runs,
             statistics=None,
-            **identity()._asdict(),
         )
         if held is not None:
             _need_same(target, held, start)
@@ -302,7 +290,7 @@ def _need_same(target: Path, held: Campaign, wanted: Campaign) -> None:
     """Raise if the campaign of a file is another one, naming the first difference."""
     here, there = (
         dict(_values(campaign.plan.to_table()))
-        | {name: getattr(campaign, name) for name in ("machine", "chunk", *Identity._fields)}
+        | {"machine": campaign.machine, "chunk": campaign.chunk, **campaign.identity._asdict()}
         for campaign in (wanted, held)
     )
     for name in sorted(here.keys() | there.keys()):
@@ -343,7 +331,7 @@ def _write(path: Path, campaign: Campaign) -> None:
         attributes = {
             "kind": KIND,
             "format": FORMAT,
-            "version": campaign.version,
+            **campaign.identity._asdict(),
             "versions": json.dumps({"python": platform.python_version(), **packages}),
             "conventions": CONVENTIONS,
             "scenario": scenarios.scenario_to_toml(plan.scenario),
@@ -352,9 +340,6 @@ def _write(path: Path, campaign: Campaign) -> None:
             "digest": plan.digest,
             "seed": plan.seed,
             "machine": campaign.machine,
-            "sources": campaign.sources,
-            "arithmetic": campaign.arithmetic,
-            "reason": campaign.reason,
             "chunk": campaign.chunk,
             "runs": campaign.runs,
             "finished_runs": campaign.finished_runs,
@@ -426,13 +411,10 @@ def read(path: str | os.PathLike[str]) -> Campaign:
         return Campaign(
             plan=plan,
             machine=one_of("machine", attributes["machine"], MACHINES),
-            reason=str(attributes["reason"]),
             chunk=chunk,
             runs=count("runs", attributes["runs"]),
             statistics=statistics,
             whole=_statistics_of(file["resume/whole"], plan) if "resume/whole" in file else whole,
-            version=str(attributes["version"]),
-            sources=str(attributes["sources"]),
-            arithmetic=str(attributes["arithmetic"]),
+            identity=Identity(*(str(attributes[name]) for name in Identity._fields)),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )

@@ -33,7 +33,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     name = held.plan.scenario.name or "a scenario"
     content = page.page(
         f"Monte Carlo: {name}",
-        f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.version}",
+        f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.identity.version}",
         page.judged(judgement),
         page.section("Evidence", page.table(judgement.listing())),
         page.section("Key numbers", *parts),

@@ -187,7 +187,7 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         example_sigma=examples[1],
         **arrays,
     )
-    held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=statistics)
+    held = campaign.Campaign(plan=plan, machine="lanes", chunk=4, runs=8, statistics=statistics)
     campaign._write(path, held)
 
 
