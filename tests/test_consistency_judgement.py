@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
-from two_stars import stars
+from spin_plan import PLAN, SETUP
 
-from strapdown import consistency, montecarlo, motion, scenarios
+from strapdown import consistency, montecarlo
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
-from strapdown.estimation import ProcessNoise, setup
+from strapdown.estimation import ProcessNoise
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
@@ -257,55 +257,35 @@ def test_resolution_is_the_factor_that_bounds_leave(samples):
 # ------------------------------------------------------------------------------------------------------------ independent runs
 
 
-def scenario():
-    return scenarios.Scenario(
-        motion=motion.rest(),
-        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        sensors=stars(1e-3, 1e-3),
-        rate=10.0,
-        duration=40.0,
-        name="rest",
-    )
-
-
-@pytest.fixture(scope="module")
-def plan():
-    filter_setup = setup.FilterSetup(
-        process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6), attitude_sigma=2e-3, bias_sigma=1e-4
-    )
-    return montecarlo.Plan(scenario=scenario(), setup=filter_setup, seed=3, epochs=20, nis_bins=10)
-
-
 @functools.cache
-def statistics_of(plan, **changes):
-    filter_setup = replace(plan.setup, **changes)
-    return montecarlo.run(plan.scenario, (filter_setup,), runs=200, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
+def statistics_of(runs=200, **changes):
+    return montecarlo.run_plan(replace(PLAN, setup=replace(SETUP, **changes), seed=3), runs=runs)
 
 
-def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
-    good = statistics_of(plan).judge()
+def test_right_runs_are_consistent_and_wrong_ones_are_reported():
+    good = statistics_of().judge()
     assert good.verdict == "consistent"
     assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
-    assert {f.of for f in good.findings if f.name == "NIS"} == {"star 1", "star 2"}
+    assert {f.of for f in good.findings if f.name == "NIS"} == {"sun sensor", "star"}
     assert good.words == good.headline  # what a passing statistic would mean is not said
-    sure = statistics_of(plan, measurement_sigma_factor=0.8).judge()
+    sure = statistics_of(measurement_sigma_factor=0.8).judge()
     assert sure.verdict == "not consistent"
     assert "optimistic" in sure.reason
     assert sure.words.split("\n  - ")[1:] == [f.means for f in sure.findings if f.rejected and f.means]
     names = {f.name for f in sure.findings if f.rejected}
     assert {"ANEES", "log-NEES", "NIS", "coverage"} <= names
     assert "mean error" not in names
-    modest = statistics_of(plan, measurement_sigma_factor=1.3).judge()
+    modest = statistics_of(measurement_sigma_factor=1.3).judge()
     assert "pessimistic" in modest.reason
 
 
-def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
+def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all():
     """99 of 100 errors of one state within 1 σ at one epoch, all others the expected number: binomial, times the number of tests."""
-    few = montecarlo.run(plan.scenario, (plan.setup,), runs=100, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
+    few = statistics_of(runs=100)
     usual = np.array([68, 95, 100])
-    counts = np.tile(usual, (21, 6, 1))
-    counts[20, 4, 0] = 82
-    judged = replace(few, coverage=counts).judge(epochs=np.array([10, 20]))
+    counts = np.tile(usual, (7, 6, 1))
+    counts[6, 4, 0] = 82
+    judged = replace(few, coverage=counts).judge(epochs=np.array([3, 6]))
     (coverage,) = (finding for finding in judged.findings if finding.name == "coverage")
     least = 2.0 * scipy.stats.binom.sf(81, 100, math.erf(math.sqrt(0.5)))
     assert (coverage.of, coverage.value) == ("bias y", 0.82)
@@ -313,14 +293,14 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
     assert "82 % of the bias y errors lie within 1 σ" in coverage.means
 
 
-def test_few_runs_cannot_tell(plan):
-    few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10, machine="auto")[0]
+def test_few_runs_cannot_tell():
+    few = statistics_of(runs=2)
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
     assert starved.judge().verdict == "cannot tell"
 
 
-def test_a_mean_error_is_reported(plan):
-    good = statistics_of(plan)
+def test_a_mean_error_is_reported():
+    good = statistics_of()
     shift = 0.5 * good.rms_error[:, 5]
     square = good.error_product_sum.copy()
     square[:, 5, 5] += good.runs * shift**2
@@ -330,8 +310,8 @@ def test_a_mean_error_is_reported(plan):
     assert [(f.name, f.of) for f in judged.findings if f.rejected] == [("mean error", "bias z")]
 
 
-def test_runs_that_failed_are_not_consistent(plan):
-    good = statistics_of(plan)
+def test_runs_that_failed_are_not_consistent():
+    good = statistics_of()
     finite = good.finite.copy()
     finite[-1] -= 1
     judged = replace(good, finite=finite).judge()
@@ -339,7 +319,7 @@ def test_runs_that_failed_are_not_consistent(plan):
     assert "1 of 200 runs failed" in judged.words
 
 
-def test_bounds_are_those_that_decide(plan):
+def test_bounds_are_those_that_decide():
     """NIS from right to wrong: the value leaves the printed bounds where Holm's procedure rejects it, not at 1 % of it alone."""
     decided = []
     for scale in np.linspace(1.0, 1.12, 13):
@@ -352,12 +332,14 @@ def test_bounds_are_those_that_decide(plan):
     assert all(inside is not rejected for inside, rejected, _ in decided)
     assert any(inside and p < 0.01 for inside, _, p in decided)  # alone it would have been rejected
     for factor in (1.0, 0.97, 0.8):
-        judgement = statistics_of(plan, measurement_sigma_factor=factor).judge()
+        judgement = statistics_of(measurement_sigma_factor=factor).judge()
         bounded = [finding for finding in judgement.findings if math.isfinite(finding.low)]
         assert {finding.name for finding in bounded} == {"ANEES", "log-NEES", "NIS"}
         assert all((finding.low <= finding.value <= finding.high) is not finding.rejected for finding in bounded)
         assert all(
-            re.fullmatch(r"(mean [\d.]+, )?worst at \d+ s", finding.at) for finding in bounded if finding.name != "NIS"
+            re.fullmatch(r"(mean [\d.]+, )?worst at [\d.]+ s", finding.at)
+            for finding in bounded
+            if finding.name != "NIS"
         )
 
 

@@ -16,7 +16,6 @@ from strapdown import estimation, gyro, motion, scenarios, tuning, vectors
 from strapdown.estimation import error_states, setup
 from strapdown.motion.orbit import CircularOrbit
 from strapdown.results import equal
-from strapdown.tuning.diagnosis import Cause
 
 FOR_CHECKERS = {
     "CircularOrbit": CircularOrbit,
@@ -145,23 +144,3 @@ def test_methods_are_equal_if_function_and_object_are():
     assert equal(field, same)
     assert not equal(field, other)
     assert not equal(field, CircularOrbit(altitude=5e5).position)
-
-
-def test_results_are_compared_by_identity():
-    """Two causes with the same estimate are two causes; the one that is listed is found."""
-
-    def cause() -> Cause:
-        return Cause(
-            name="R",
-            of="star",
-            estimate=np.zeros(3),
-            standard_error=np.ones(3),
-            unit="",
-            gain=1.0,
-            log_p=-1.0,
-            words="",
-        )
-
-    first, other = cause(), cause()
-    assert first in (other, first)
-    assert first not in (other,)

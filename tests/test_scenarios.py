@@ -262,13 +262,7 @@ def test_lists_of_numbers_stand_on_one_line():
 
 
 def test_one_scale_factor_for_all_axes_and_any_boresight_go_through_a_file():
-    text = """
-rate_hz = 10.0
-duration_s = 10.0
-[motion]
-type = "rest"
-[gyro]
-angle_random_walk_deg_per_sqrt_hour = 0.1
+    tracker = """[gyro]
 scale_factor_ppm = 200
 [[sensors]]
 type = "attitude"
@@ -278,7 +272,7 @@ sigma_about_arcsec = 30.0
 rate_hz = 2.0
 boresight = [1.2, 0.0, 1.6]
 """
-    scenario = scenario_from_toml(text)
+    scenario = scenario_from_toml(REST + tracker)
     np.testing.assert_allclose(scenario.gyro.scale_factor, [200e-6] * 3, rtol=1e-15)
     np.testing.assert_allclose(scenario.sensors[0].boresight, [0.6, 0.0, 0.8])
     again = scenario_from_toml(scenario_to_toml(scenario))
