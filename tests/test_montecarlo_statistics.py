@@ -406,8 +406,9 @@ def test_whole_epochs_cut_into_whole_steps():
     four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
     assert montecarlo.whole_epochs(SCENARIO, SETUP) == 80
     assert montecarlo.whole_epochs(SCENARIO, four) == 60
-    with pytest.raises(InputError, match="whole number of four-sample steps"):
-        montecarlo.whole_epochs(replace(SCENARIO, duration=2.41), four)
+    longer = replace(SCENARIO, duration=2.41)
+    with pytest.raises(InputError, match="epochs of whole four-sample steps"):
+        planned(scenario=longer, setup=four, epochs=montecarlo.whole_epochs(longer, four))
 
 
 def test_gyro_dispersions_have_their_sigma_and_their_place():

@@ -213,7 +213,7 @@ def check_attitudes(
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
         derivatives = jacobian(common.time, aligned, true)
-        explained = explanations(error, readings, frame, probabilities, derivatives, confidence_level=confidence_level)
+        explained = explanations(error, readings[frame], derivatives, confidence_level=confidence_level)
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
     estimate = replace(estimate, truth=true, motion=own.motion)
@@ -312,24 +312,14 @@ def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) ->
 
 
 def explanations(
-    error: Array,
-    readings: Mapping[str, Array],
-    frame: str,
-    probabilities: Mapping[str, float],
-    derivatives: Array,
-    *,
-    confidence_level: float = 0.99,
+    error: Array, covariance: Array, derivatives: Array, *, confidence_level: float = 0.99
 ) -> tuple[Explanation, ...]:
     """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
     ``derivatives`` (m, 3, 7) are those of :func:`jacobian`. For a consistent filter none is likely with ``confidence_level``.
     """
-    P = readings[frame][:, :3, :3]
-    candidates = [
-        *_constant_differences(error, P, derivatives),
-        _wrong_scale(whitened(error, P)),
-        *_other_frames(error, readings, frame, probabilities),
-    ]
+    P = covariance[:, :3, :3]
+    candidates = [*_constant_differences(error, P, derivatives), _wrong_scale(whitened(error, P))]
     likely = holm([candidate.p_value for candidate in candidates], 1.0 - confidence_level)
     marked = [replace(candidate, likely=is_likely) for candidate, is_likely in zip(candidates, likely, strict=True)]
     # Specific causes come before a factor on σ, which would absorb all of them.
@@ -365,22 +355,6 @@ def _wrong_scale(white: Array) -> Explanation:
     if average is not None and average.reliable:
         p_value = mean_p_value(average.mean, 3, average.effective, certainty=average.certainty)
     return Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value)
-
-
-def _other_frames(
-    error: Array, readings: Mapping[str, Array], frame: str, probabilities: Mapping[str, float]
-) -> Iterator[Explanation]:
-    """Yield the definitions of the covariance that the errors fit better than the one used."""
-    for name, P in readings.items():
-        if name == frame or probabilities[name] <= probabilities[frame]:
-            continue
-        white = whitened(error, P[:, :3, :3])
-        yield Explanation(
-            name=f"covariance meant as {name}",
-            value=f"{100.0 * probabilities[name]:.3g} %",
-            nees=float(np.mean(white * white)),
-            p_value=min(1.0, probabilities[frame] / max(probabilities[name], 1e-300)),
-        )
 
 
 def _constant_p_value(total: Array, scores: Array) -> float:

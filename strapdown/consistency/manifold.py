@@ -49,16 +49,12 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
         raise InputError(
             f"attitude, bias, true_attitude and true_bias have {', '.join(map(str, rows))} rows; give all at the same times"
         ) from None
-    pairs = {"attitude": (attitude, true_attitude), "bias": (bias, true_bias)}
-    own, true = (
-        {
-            name: array(f"{prefix}{name}", pair[k], (..., 4 - i), allow_nan=name == "bias")
-            for i, (name, pair) in enumerate(pairs.items())
-        }
-        for k, prefix in enumerate(("", "true_"))
+    q, true_q = array("attitude", attitude, (..., 4)), array("true_attitude", true_attitude, (..., 4))
+    b, true_b = (
+        array(name, value, (..., 3), allow_nan=True) for name, value in (("bias", bias), ("true_bias", true_bias))
     )
-    turn = quaternion.multiply(quaternion.conjugate(own["attitude"]), true["attitude"])
-    return np.concatenate([quaternion.log(turn), true["bias"] - own["bias"]], axis=-1)
+    turn = quaternion.multiply(quaternion.conjugate(q), true_q)
+    return np.concatenate([quaternion.log(turn), true_b - b], axis=-1)
 
 
 def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:

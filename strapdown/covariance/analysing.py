@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, non_negative
-from strapdown.covariance.consider import Consider, check_considered
+from strapdown.checks import Array
+from strapdown.covariance.consider import Consider, check_considered, checked_size
 from strapdown.covariance.deterministic_errors import (
     MIN_ERROR,
     DeterministicError,
@@ -90,8 +90,8 @@ def analyse(
     check_considered(scenario, consider)
     attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
     bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
-    non_negative("initial_attitude_sigma", attitude_sigma, unit="rad")
-    non_negative("initial_bias_sigma", bias_sigma, unit="rad/s")
+    checked_size("initial_attitude_sigma", attitude_sigma, unit="rad")
+    checked_size("initial_bias_sigma", bias_sigma, unit="rad/s")
     path = trajectory_of(scenario, setup, epochs)
     fixed = fixed_errors(scenario, setup, path)
     considered = considered_errors(scenario, consider, path)

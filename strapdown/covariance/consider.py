@@ -12,6 +12,19 @@ from strapdown.results import ByValue
 from strapdown.scenarios import Scenario
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
+LARGEST_SIZE = 1e12
+"""Maximum considered or initial error, in the units of :class:`Consider`; keeps its square in the range of doubles."""
+
+
+def checked_size(name: str, value: float, *, unit: str = "") -> float:
+    """Return the size of an error, checked to be zero or more and at most :data:`LARGEST_SIZE`."""
+    size = non_negative(name, value, unit=unit)
+    if size > LARGEST_SIZE:
+        raise InputError(
+            f"{name} is {size:g}{f' {unit}' if unit else ''}; no error is larger than {LARGEST_SIZE:g}: check its unit"
+        )
+    return size
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Consider(ByValue):
@@ -43,14 +56,14 @@ class Consider(ByValue):
 
     def __post_init__(self) -> None:
         """Check every number."""
-        non_negative("scale_factor", self.scale_factor)
-        non_negative("misalignment", self.misalignment, unit="rad")
-        non_negative("g_sensitivity", self.g_sensitivity, unit="rad/s per m/s²")
+        checked_size("scale_factor", self.scale_factor)
+        checked_size("misalignment", self.misalignment, unit="rad")
+        checked_size("g_sensitivity", self.g_sensitivity, unit="rad/s per m/s²")
         for name in ("sensor_bias", "mounting", "time_offset"):
             values = getattr(self, name)
             if not isinstance(values, Mapping):
                 raise InputError(f"{name} is {values!r}; give a number for each sensor by its name")
-            checked = {str(sensor): non_negative(f"{name}[{sensor!r}]", value) for sensor, value in values.items()}
+            checked = {str(sensor): checked_size(f"{name}[{sensor!r}]", value) for sensor, value in values.items()}
             object.__setattr__(self, name, checked)
 
 

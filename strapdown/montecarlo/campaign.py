@@ -373,8 +373,9 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
     lengths = lengths_of(plan) | {"worst": len(arrays["worst_run"]), "examples": len(arrays["example_run"])}
     for name, layout in ARRAYS.items():
-        shape, kind = tuple(lengths.get(n, n) for n in layout.shape), "i" if layout.counts else "f"
-        if arrays[name].shape != shape or arrays[name].dtype.kind != kind:
+        value, shape = arrays[name], tuple(lengths.get(n, n) for n in layout.shape)
+        finite_sums = layout.shape[0] != "epochs" or np.isfinite(value).all()
+        if value.shape != shape or value.dtype.kind != ("i" if layout.counts else "f") or not finite_sums:
             raise InputError(f"{place}: {name} does not fit the plan; the file is damaged: run the campaign again")
     runs = count(f"{place}: runs", reading.attributes(group)["runs"])
     return Statistics(runs=runs, sensors=plan.sensors, plan=plan, **arrays)

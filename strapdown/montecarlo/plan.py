@@ -250,12 +250,7 @@ def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
 
 
 def whole_epochs(scenario: Scenario, filter_setup: FilterSetup) -> int:
-    """Return the largest number of epochs, at most 100, that divide the scenario into whole filter steps."""
+    """Return the largest number of epochs, at most 100, that divide the whole filter steps of a scenario."""
     need_setup(filter_setup)
-    samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
-    if samples % step:
-        raise InputError(
-            f"{samples} gyro samples are not a whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
-            f"that gives a multiple of {step}"
-        )
-    return max(n for n in range(1, 101) if (samples // step) % n == 0)
+    steps = round(scenario.duration * scenario.rate) // filter_setup.integration.samples
+    return max(n for n in range(1, 101) if steps % n == 0)
