@@ -97,6 +97,8 @@ class ErrorSize(NamedTuple):
     """Median of the angle, rad."""
     maximum: float
     """Maximum of the angle, rad."""
+    samples: int
+    """Number of samples."""
     coverage: float = math.nan
     """Fraction of the errors inside the 95 % region of the covariance; NaN without a covariance."""
     rms_over_sigma: float = math.nan
@@ -109,10 +111,8 @@ class Accuracy(Listed):
 
     Parameters
     ----------
-    samples : mapping of str to int
-        Number of samples by span: "all samples", "movement" if the truth states it.
     given : mapping of str to mapping of str to ErrorSize
-        Errors by span and by part (:data:`KINDS`), as given.
+        Errors by span ("all samples", and "movement" if the truth states it) and by part (:data:`KINDS`), as given.
     aligned : mapping, default empty
         The same after clocks and frames are aligned.
     alignment : Alignment, optional
@@ -121,11 +121,15 @@ class Accuracy(Listed):
         RMS error of the gyro bias and the root mean square of its σ, both of three axes together, rad/s.
     """
 
-    samples: Mapping[str, int]
     given: Mapping[str, Mapping[str, ErrorSize]]
     aligned: Mapping[str, Mapping[str, ErrorSize]] = field(default_factory=dict)
     alignment: Alignment | None = None
     bias: tuple[float, float] | None = None
+
+    @property
+    def samples(self) -> dict[str, int]:
+        """Number of samples by span."""
+        return {span: sizes["total"].samples for span, sizes in (self.given or self.aligned).items()}
 
     @property
     def rms_over_sigma(self) -> dict[str, float]:
@@ -188,11 +192,10 @@ class Accuracy(Listed):
                 for span, sizes in table.items()
             }
 
-        summary = {"samples": dict(self.samples), "given": angles(self.given), "aligned": angles(self.aligned)}
+        summary = {"samples": self.samples, "given": angles(self.given), "aligned": angles(self.aligned)}
         if self.bias is not None:
-            summary["bias"] = dict(
-                zip(("rms_deg_per_h", "sigma_deg_per_h"), np.divide(self.bias, DEGREE_PER_HOUR), strict=True)
-            )
+            rms, sigma = self.bias
+            summary["bias"] = {"rms_deg_per_h": rms / DEGREE_PER_HOUR, "sigma_deg_per_h": sigma / DEGREE_PER_HOUR}
         if self.alignment is not None:
             summary["alignment"] = self.alignment.summary()
         return plain(summary)  # type: ignore[no-any-return]
@@ -213,15 +216,13 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     own = Series(estimate.time, estimate.attitude, P if P is not None and np.isfinite(P).all() else None)
     theirs = truth.taken(known)
     as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else own.covariance[known])
-    alignment: Alignment | None = None
-    aligned: dict[str, dict[str, ErrorSize]] = {}
+    alignment, aligned, bias = None, dict[str, dict[str, ErrorSize]](), None
     if align:
-        alignment, aligned, _ = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
-    bias = None
+        alignment, aligned = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
     if truth.has_bias and estimate.has_bias:
         squares = np.sum((estimate.bias - truth.bias) ** 2, axis=1), np.sum(estimate.variance[:, 3:], axis=1)
         bias = tuple(float(np.sqrt(np.mean(square))) for square in squares)
-    return Accuracy(samples=_numbers(theirs), given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]
+    return Accuracy(given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]
 
 
 def accuracy_of(own: Series, theirs: Series) -> Accuracy:
@@ -229,27 +230,21 @@ def accuracy_of(own: Series, theirs: Series) -> Accuracy:
 
     The errors as given are left out if the two have no times in common.
     """
-    alignment, aligned, samples = _aligned_sizes(own, theirs)
+    alignment, aligned = _aligned_sizes(own, theirs)
     as_stored: dict[str, dict[str, ErrorSize]] = {}
     with contextlib.suppress(InputError):
         matched, truth = at_common_times(own, theirs, 0.0)
         P = None if matched.covariance is None else matched.covariance[:, :3, :3]
-        as_stored, samples = _sizes(matched.attitude, truth, P), _numbers(truth)
-    return Accuracy(samples=samples, given=as_stored, aligned=aligned, alignment=alignment)
+        as_stored = _sizes(matched.attitude, truth, P)
+    return Accuracy(given=as_stored, aligned=aligned, alignment=alignment)
 
 
-def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]], dict[str, int]]:
-    """Return the alignment of two histories, the errors after it, and the number of samples by span."""
+def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]]]:
+    """Return the alignment of two histories, and the errors after it."""
     thin = slice(None, None, max(1, len(own.time) // FITTED))
     _, alignment = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
     matched, truth = at_common_times(own, theirs, alignment.offset)
-    return alignment, _sizes(in_truth_frames(matched.attitude, alignment), truth, None), _numbers(truth)
-
-
-def _numbers(truth: Truth) -> dict[str, int]:
-    """Return the number of samples by span."""
-    numbers = {"all samples": len(truth.attitude)}
-    return numbers if truth.movement is None else {**numbers, "movement": int(truth.movement.sum())}
+    return alignment, _sizes(in_truth_frames(matched.attitude, alignment), truth, None)
 
 
 def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:
@@ -271,12 +266,12 @@ def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str
 def _size(kind: str, angle: Array, squares: Array | None) -> ErrorSize:
     from scipy.special import chdtri
 
-    rms, middle, most = float(np.sqrt(np.mean(angle**2))), float(np.median(angle)), float(angle.max())
+    size = ErrorSize(float(np.sqrt(np.mean(angle**2))), float(np.median(angle)), float(angle.max()), len(angle))
     if squares is None:
-        return ErrorSize(rms, middle, most)
+        return size
     degrees = len(_STATES[kind])
     inside = float(np.mean(squares <= chdtri(degrees, 1.0 - REGION)))
-    return ErrorSize(rms, middle, most, inside, float(np.sqrt(np.mean(squares) / degrees)))
+    return size._replace(coverage=inside, rms_over_sigma=float(np.sqrt(np.mean(squares) / degrees)))
 
 
 def _normalised(attitude: Array, true_attitude: Array, P: Array) -> dict[str, Array]:

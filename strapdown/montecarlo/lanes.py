@@ -59,14 +59,7 @@ from strapdown.montecarlo.statistics import (
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth, compress
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import (
-    Accelerometer,
-    AttitudeSensor,
-    HorizonSensor,
-    Magnetometer,
-    VectorMeasurements,
-    VectorSensor,
-)
+from strapdown.vectors import Accelerometer, AttitudeSensor, Magnetometer, VectorMeasurements
 
 NAME = "lanes"
 CHUNK = 200
@@ -83,7 +76,7 @@ _NOT_OF_THE_GYRO = {
     "timestamp_offset": 0.0,
     "drop_probability": 0.0,
 }
-_SENSORS = (VectorSensor, HorizonSensor, Magnetometer, Accelerometer, AttitudeSensor)
+_SENSORS = (vectors.VectorSensor, vectors.HorizonSensor, Magnetometer, Accelerometer, AttitudeSensor)
 
 
 def supports(plan: Plan) -> str | None:
@@ -162,11 +155,9 @@ _PREPARED: weakref.WeakKeyDictionary[Plan, _Prepared] = weakref.WeakKeyDictionar
 
 
 def _prepared(plan: Plan) -> _Prepared:
-    prepared = _PREPARED.get(plan)
-    if prepared is None:
-        prepared = _prepare(plan)
-        _PREPARED[plan] = prepared
-    return prepared
+    if plan not in _PREPARED:
+        _PREPARED[plan] = _prepare(plan)
+    return _PREPARED[plan]
 
 
 def _quiet(spec: GyroSpec) -> GyroSpec:

@@ -51,11 +51,9 @@ def start(
 
 def record_of(plan: Plan, run: int) -> ImuRecord:
     """Return the record of one run of a plan."""
-    remembered = _SCENARIOS.get(plan)
-    if remembered is None:
-        remembered = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
-        _SCENARIOS[plan] = remembered
-    return simulate(unit(plan, run, remembered), plan.seed, run)
+    if plan not in _SCENARIOS:
+        _SCENARIOS[plan] = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
+    return simulate(unit(plan, run, _SCENARIOS[plan]), plan.seed, run)
 
 
 class _Remembered:

@@ -207,8 +207,8 @@ def _word(table: dict[str, Any], place: str, choices: Any) -> str:
 def _read_motion(table: dict[str, Any], place: str) -> Motion:
     word = _word(table, place, [*MOTIONS, "rest", "composed"])
     if word == "rest":
-        form: Form = {"initial_attitude": tables.PLAIN}
-        return tables.construct(motion.rest, tables.decode(table, form, place), table, form, place)  # type: ignore[no-any-return]
+        rest: Form = {"initial_attitude": tables.PLAIN}
+        return tables.build(motion.ConstantRate, table, rest, place, rate=np.zeros(3))  # type: ignore[no-any-return]
     if word == "composed":
         known_keys(place, table, ("base", "vibration"))
         parts = {
