@@ -50,14 +50,11 @@ def test_ljung_box_has_its_size():
         assert 0.04 < np.mean(refused) < 0.06
 
 
-@pytest.mark.parametrize(("runs", "n", "groups"), [(50, 6, 3000), (20, 3, 3000)])
-def test_statistics_of_many_runs(runs, n, groups):
-    white = np.random.default_rng(3).standard_normal((groups, runs, n))
-    for name, p in power.many_run_p_values(white).items():
-        share = np.mean(p < 0.01)
-        assert abs(share - 0.01) < 4.0 * np.sqrt(0.01 * 0.99 * (1.0 / groups + 1.0 / 20_000)), (name, share)
-        share = np.mean(p < 0.05)
-        assert abs(share - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / groups + 1.0 / 20_000)), (name, share)
+@pytest.mark.parametrize(("runs", "n"), [(50, 6), (20, 3)])
+def test_statistics_of_many_runs(runs, n):
+    white = np.random.default_rng(3).standard_normal((3000, runs, n))
+    for p in power.many_run_p_values(white).values():
+        within_binomial(p, 4.0)
 
 
 def test_autocorrelation_bounds_hold():

@@ -547,13 +547,9 @@ def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> 
 
 def _named(some: Sequence[Part], parts: Sequence[Part]) -> str:
     """Return the names of some of the parts, those of all sensors' innovations together as "innovations"."""
-    sensors = [part.of for part in some if part.of.startswith(INNOVATIONS)]
-    every = [part.of for part in parts if part.of.startswith(INNOVATIONS)]
-    names = [part.of for part in some if part.of not in sensors]
-    if sensors:
-        of = listed([name.removeprefix(INNOVATIONS) for name in sensors])
-        names.append("innovations" if sensors == every else f"{INNOVATIONS}{of}")
-    return listed(names)
+    sensors, every = ([part.of for part in group if part.of.startswith(INNOVATIONS)] for group in (some, parts))
+    states = [part.of for part in some if part.of not in sensors]
+    return listed([*states, *(["innovations"] if sensors and sensors == every else sensors)])
 
 
 def listed(names: Sequence[str]) -> str:

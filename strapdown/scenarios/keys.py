@@ -84,21 +84,17 @@ def sections() -> list[Section]:
 def named(name: str) -> list[Section]:
     """Return the tables of a group, ``top``, ``motion``, ``gyro`` or ``sensors``, or those of one type, such as "coning", or header."""
     every = sections()
-    sections_named = [
-        section for section in every if name in (section.group, section.type, section.header, *_names(section.header))
+    tables = [section.header.strip("[]") for section in every]
+    selected = [
+        section
+        for section, table in zip(every, tables, strict=True)
+        if name in (section.group, section.type, section.header, table, table.rpartition(".")[2])
     ]
-    if not sections_named:
-        groups = [section.group for section in every]
-        tables = [section.type or _names(section.header)[0] for section in every if section.group != "top"]
-        known = dict.fromkeys([*groups, *tables])
+    if not selected:
+        types = [section.type or table for section, table in zip(every, tables, strict=True) if section.group != "top"]
+        known = dict.fromkeys([*(section.group for section in every), *types])
         raise InputError(f"there is no section {name!r} in a scenario file; name one of {', '.join(known)}")
-    return sections_named
-
-
-def _names(header: str) -> tuple[str, str]:
-    """Return the name of a table without brackets, and its last part: motion.harmonics and harmonics."""
-    name = header.strip("[]")
-    return name, name.rpartition(".")[2]
+    return selected
 
 
 def heading(section: Section) -> str:
