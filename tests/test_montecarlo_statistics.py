@@ -166,6 +166,12 @@ def test_merging_parts_is_the_whole():
         assert np.allclose(a, getattr(other, name), rtol=1e-12, atol=1e-12 * np.abs(a).max()), name
 
 
+def test_twenty_epochs_without_the_first_are_judged():
+    sums = scalar.run_chunk(PLAN, 0, 1)
+    assert sums.judged_epochs.tolist() == [1, 2, 3, 4, 5, 6]
+    assert replace(sums, time=np.arange(101.0)).judged_epochs.tolist() == list(range(5, 101, 5))
+
+
 def test_worst_runs_are_the_largest_and_of_equal_ones_the_first():
     run, score = statistics.worst(np.arange(30), np.array([1.0, 7.0, 7.0] * 10))
     assert run.tolist() == [1, 2, 4, 5, 7, 8, 10, 11, 13, 14]
