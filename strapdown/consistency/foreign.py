@@ -190,7 +190,7 @@ def check_attitudes(
     origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
     with_bias = own.bias is not None and truth.bias is not None
     P = own.covariance if with_bias or own.covariance is None else own.covariance[:, :3, :3]
-    whole = series_of("", own.seconds(origin), own.attitude, P, own.bias if with_bias or P is None else None)
+    whole = series_of("", own.seconds(origin), own.attitude, P, own.bias if with_bias else None)
     theirs = series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement)
     remarks: list[str] = []
     whole, alignment = align_series(whole, theirs, _wanted(align), remarks)
