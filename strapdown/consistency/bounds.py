@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, count
 
-SIGMAS = (1.0, 2.0, 3.0)
-"""Multiples of σ at which the coverage is evaluated."""
+COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
+"""Fraction of a consistent filter's errors inside 1, 2, 3 σ."""
 
 
 def tail(confidence_level: float) -> float:
@@ -151,12 +151,10 @@ def log_mean_p_value(mean: float, degrees: int, samples: int) -> float:
 
 def coverage_p_values(inside: ArrayLike, samples: int) -> Array:
     """Return two-sided binomial p-values of the fractions (..., 3) of ``samples`` independent errors inside 1, 2 and 3 σ."""
-    from scipy.special import erf
     from scipy.stats import binom
 
-    expected = erf(np.array(SIGMAS) / math.sqrt(2.0))
     number = np.round(np.asarray(inside) * samples)
-    lower, upper = binom.cdf(number, samples, expected), binom.sf(number - 1.0, samples, expected)
+    lower, upper = binom.cdf(number, samples, COVERED), binom.sf(number - 1.0, samples, COVERED)
     return np.asarray(np.minimum(1.0, 2.0 * np.minimum(lower, upper)))
 
 

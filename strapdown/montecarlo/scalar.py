@@ -205,8 +205,6 @@ def _nees(error: Array, P: Array) -> Array:
     try:
         return consistency.nees(error, P)
     except InputError:
-        result = np.full(len(error), np.nan)
-        for k, (e, p) in enumerate(zip(error, P, strict=True)):
-            if np.isfinite(e).all() and np.isfinite(p).all() and np.linalg.eigvalsh(p)[0] > 0.0:
-                result[k] = consistency.nees(e, p)
-        return result
+        if len(error) == 1:
+            return np.full(1, np.nan)
+        return np.concatenate([_nees(error[k : k + 1], P[k : k + 1]) for k in range(len(error))])

@@ -11,10 +11,11 @@ import numpy as np
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
+from strapdown.consistency.bounds import COVERED
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
-from strapdown.montecarlo.statistics import COVERED, Statistics
+from strapdown.montecarlo.statistics import Statistics
 from strapdown.results import Column, Table
 
 QUANTILES = (0.5, 0.95, 0.997)

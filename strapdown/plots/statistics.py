@@ -12,8 +12,9 @@ from matplotlib.patches import Ellipse
 
 from strapdown.checks import Array, one_of
 from strapdown.consistency import mean_bounds
+from strapdown.consistency.bounds import COVERED
 from strapdown.montecarlo import Statistics
-from strapdown.montecarlo.statistics import COVERED, SUBSETS
+from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.plots import style
 from strapdown.units import angle_unit, rate_unit
 
