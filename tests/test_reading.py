@@ -411,8 +411,8 @@ def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_pat
     path = tmp_path_of(known, tmp_path)
     plan = campaign.read(path).plan
     held = campaign.read(path)
-    campaign._write(path, dataclasses.replace(held, **engine.identity()._asdict()), plan.to_table())
-    assert campaign.read(path).arithmetic == engine.arithmetic()
+    campaign._write(path, dataclasses.replace(held, identity=engine.identity()))
+    assert campaign.read(path).identity == engine.identity()
     assert campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes").finished
     here = engine.identity()
     for change, words in (

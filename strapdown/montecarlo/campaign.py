@@ -218,6 +218,7 @@ def run(
             chunk=default if chunk is None else count("chunk", chunk),
             runs=runs,
             statistics=None,
+            identity=identity(),
         )
         if held is not None:
             _need_same(target, held, start)

@@ -21,7 +21,7 @@ import strapdown
 from strapdown.checks import InputError, count, one_of
 from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo import lanes, scalar
-from strapdown.montecarlo.plan import Plan, dispersed
+from strapdown.montecarlo.plan import Dispersions, Plan, dispersed
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
 from strapdown.scenarios import Scenario
@@ -264,6 +264,7 @@ def run(
     seed: int,
     epochs: int = 100,
     nis_bins: int = 100,
+    dispersions: Dispersions | None = None,
     machine: str = "scalar",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -282,7 +283,7 @@ def run(
         Number of independent runs.
     seed : int
         Seed of all random streams.
-    epochs, nis_bins : int, default 100
+    epochs, nis_bins, dispersions : optional
         See :class:`Plan`.
     machine : {"scalar", "auto", "lanes"}
         "auto": the lanes if they support every setup.
@@ -294,8 +295,8 @@ def run(
     list of Statistics
         One per setup.
     """
-    common = {"scenario": scenario, "seed": seed, "epochs": epochs, "nis_bins": nis_bins}
-    plans = tuple(Plan(setup=setup, **common) for setup in setups)  # type: ignore[arg-type]
+    common: dict[str, Any] = {"scenario": scenario, "seed": seed, "epochs": epochs, "nis_bins": nis_bins}
+    plans = tuple(Plan(setup=setup, dispersions=dispersions or Dispersions(), **common) for setup in setups)
     names = {choose(plan, machine).machine for plan in plans}
     name = names.pop() if len(names) == 1 else scalar.NAME
     return list(_run(plans, name, runs, None, in_threads(threads), progress))
