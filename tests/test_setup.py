@@ -208,7 +208,7 @@ def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
         assert plan.unmodelled == outliers
         estimate = sd.estimate(record, **change)
         assert ("outliers" in " ".join(estimate.remarks)) == bool(outliers)
-        runs = montecarlo.campaign.Campaign(plan=plan, machine="scalar", reason="", chunk=1, runs=1, statistics=None)
+        runs = montecarlo.campaign.Campaign(plan=plan, machine="scalar", chunk=1, runs=1, statistics=None)
         said = " ".join([*estimate.remarks, *montecarlo.campaign.words(runs, sd.check(estimate))])
         assert "states=True" not in said  # which has none for outliers
         assert "anees" not in runs.summary()  # no run is finished
