@@ -102,7 +102,7 @@ def test_a_factor_on_sigma_is_likely_where_it_shows(m, factor, likely):
     time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
     P, derivatives = (
         np.tile(1e-6 * np.eye(6), (m, 1, 1)),
-        alignment.jacobian(time, attitude, Truth.of_reference(attitude)),
+        alignment.jacobian(time, attitude, Truth(attitude=attitude)),
     )
     known = foreign.explanations(1e-3 * error, P, derivatives)
     (scale,) = (explanation for explanation in known if explanation.name == foreign.SCALE)
