@@ -11,10 +11,8 @@ from sims import hand_held
 from strapdown import consistency, estimation, montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import error_states, setup
-from strapdown.estimation import temperature as driven
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup.for_record import drawn_start
-from strapdown.estimation.states import Candidate, GateMemory
 from strapdown.gyro.temperature import from_table, to_table
 from strapdown.montecarlo import lanes
 from strapdown.recordings import formats, recordfiles
@@ -161,10 +159,9 @@ def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_ever
     slopes = estimate.error_states["gyro temperature"]
     ours = np.stack([estimate.rotation.as_rotvec(), estimate.bias, slopes.values], axis=1)[1:]
     # The axes turn into each other by the error's own size.
-    assert np.abs((ours - rows) / sigma)[20:].max() < 0.1
+    assert np.abs((ours - rows) / sigma)[20:].max() < 5e-3
     spread = np.stack([estimate.sigma[:, :3], estimate.sigma[:, 3:], slopes.sigma], axis=1)[1:]
-    assert np.abs(spread / sigma - 1.0)[100:].max() < 0.05  # the σ is that at the mean temperature of the stretch
-    assert len(list(driven.stretches(record, 10))) > driven.LEVELS
+    assert np.abs(spread / sigma - 1.0).max() < 1e-6
 
 
 @pytest.mark.parametrize("gate", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["parts", "gate"])
@@ -180,8 +177,7 @@ def test_parts_of_a_record_and_a_gate_agree_with_the_whole(gate):
     assert len(whole.innovations["tracker"].time) == 400
     middle = estimation.run_part(records.cut(record, 0, 2000), noise, start, blocks)[1]
     second, end = estimation.run_part(records.cut(record, 2000, 4000), noise, middle, blocks)
-    sigma = np.sqrt(np.diag(end.covariance))
-    np.testing.assert_allclose((second.bias[-1] - whole.bias[-1]) / sigma[3:6], 0.0, atol=0.04)
+    np.testing.assert_allclose(second.bias[-1], whole.bias[-1], rtol=1e-12)
     np.testing.assert_allclose(end.bias, second.bias[-1], rtol=1e-9)  # both at the temperature of the last edge
     if not gate:
         return
@@ -299,38 +295,3 @@ def test_lost_samples_keep_their_temperature():
     T = 40.0 - 20.0 * np.exp(-record.time / 100.0)
     assert len(T) == pytest.approx(13_500, abs=150)  # four σ
     np.testing.assert_allclose(record.temperature, T, rtol=1e-14)
-
-
-@pytest.mark.slow
-def test_a_sensor_that_is_wrong_all_the_time_is_locked_out_once_however_many_stretches_it_lasts():
-    record, _ = _still(2, np.zeros(3), 25.0 + 0.01 * np.arange(4001), 0.05, 1e-5, 1e-3)
-    random = np.random.default_rng(1).standard_normal((400, 4))
-    scattered = replace(record.vectors[0], attitude=random / np.linalg.norm(random, axis=1)[:, None])
-    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.001, bias_sigma=1e-4)
-    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
-    blocks = (error_states.GyroTemperature(slope_sigma=1e-5),)
-    locked = replace(record, vectors=(scattered,))
-    estimate = estimation.run(locked, noise, start, blocks, gate=Gate(probability=0.999, recovery=None))
-    assert [event.kind for event in estimate.events] == ["lock-out"]
-    assert estimate.events[0].value == 400
-
-
-def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alike():
-    """By hand: b + c ΔT, whose variance is P_bb + 2 ΔT P_bc + ΔT² P_cc."""
-    random = np.random.default_rng(3)
-    root = np.tril(random.standard_normal((10, 10))) + 5.0 * np.eye(10)  # attitude, bias, another state, the slopes
-    P, values = root.T @ root, random.standard_normal(4)
-    own, change, axis = slice(1, 4), 2.5, np.arange(3)
-    candidate = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P)
-    memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=candidate)
-    state = estimation.State(attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, gate=memory)
-    shifted = driven.shifted(state, own, change)
-    bias = axis + change * values[1:]
-    wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
-    np.testing.assert_allclose(shifted.bias, bias)
-    np.testing.assert_allclose(shifted.gate.candidate.others, np.concatenate([bias, values]))
-    for moved in (shifted, shifted.gate.candidate):
-        np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
-        np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
-    back = driven.shifted(shifted, own, -change)
-    np.testing.assert_allclose(back.covariance, P, rtol=1e-12)

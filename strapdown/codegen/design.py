@@ -15,8 +15,9 @@ from strapdown.checks import Array, InputError
 from strapdown.codegen.c import identifier
 from strapdown.codegen.program import Program, Sensor, Table
 from strapdown.codegen.recording import Recording
-from strapdown.estimation import forward, initial_state, temperature
+from strapdown.estimation import forward, initial_state
 from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import temperature_slopes
 from strapdown.estimation.features import refuse
 from strapdown.estimation.live import template
 from strapdown.estimation.setup import FilterSetup
@@ -41,7 +42,7 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     series = _series(setup, sensors)
     kinds: Mapping[str, Any] = {vectors.sensor: vectors.kind for vectors in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
-    temperature.need_none(error_states, EXPORTED)
+    refuse(EXPORTED, temperature=temperature_slopes(error_states) is not None)
     isotropic = not any(vectors.anisotropic for vectors in series)
     model = modelling.assemble(error_states, kinds, isotropic=isotropic)
     refuse(EXPORTED, record=model.of_record)

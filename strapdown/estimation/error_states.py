@@ -295,7 +295,7 @@ class GyroForce(ErrorStates):
 class GyroTemperature(ErrorStates):
     """Slopes c of the gyro's bias over temperature, constant, driven by the record's temperature: ``ḃ = c Ṫ + n_u``.
 
-    The filter's bias b is the whole bias, at the temperature of its time (:mod:`strapdown.estimation.temperature`).
+    The filter's bias b is the whole bias, at the temperature of its time.
 
     Parameters
     ----------
@@ -653,6 +653,11 @@ def spans(blocks: Sequence[ErrorStates]) -> list[tuple[ErrorStates, slice]]:
     """Return each declaration with the place of its states among those of all."""
     ends = list(accumulate(len(block.components) for block in blocks))
     return [(block, slice(end - len(block.components), end)) for block, end in zip(blocks, ends, strict=True)]
+
+
+def temperature_slopes(blocks: Sequence[ErrorStates]) -> slice | None:
+    """Return the place of the slopes of the gyro bias over temperature among the error states; None if there are none."""
+    return next((place for block, place in spans(blocks) if isinstance(block, GyroTemperature)), None)
 
 
 def check(blocks: tuple[ErrorStates, ...]) -> None:

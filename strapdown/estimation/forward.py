@@ -16,12 +16,12 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, count, is_definite, lengths
 from strapdown.estimation import model as modelling
-from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
-from strapdown.estimation.error_states import ErrorStates, spans
+from strapdown.estimation.error_states import ErrorStates, spans, temperature_slopes
+from strapdown.estimation.features import refuse
 from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
 from strapdown.estimation.model import Model
-from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule, skipped_too
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
 from strapdown.estimation.states import (
     Candidate,
     Change,
@@ -41,7 +41,7 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
-from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
+from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord
 from strapdown.records.recording import GAP
 from strapdown.vectors import KINDS, VectorMeasurements
 
@@ -237,12 +237,11 @@ def prepared(
 ) -> Problem:
     """Return a record with its measurements in order of time, and the error states as arrays.
 
-    ``driven``: whether a bias driven by temperature is allowed, as for :func:`filtered`.
+    ``driven``: whether a bias driven by temperature is allowed.
     """
     check_arguments(record=record, process_noise=process_noise)
     declared = modelling.as_blocks(error_states)
-    if not driven:
-        temperature.need_none(declared, "this estimator")
+    refuse("this estimator", temperature=not driven and temperature_slopes(declared) is not None)
     state = modelling.begin(initial, declared)
     events = schedule(record.vectors, record.time[0], record.time[-1])
     kinds = dict(zip(events.sensors, events.kinds, strict=True))
@@ -259,13 +258,7 @@ def prepared(
 
 def filtered(problem: Problem, options: Options) -> Passed:
     """Run the filter over a prepared record; raise an error if it diverges."""
-    slopes = temperature.slopes(problem.error_states)
-    if slopes is not None:
-        passed = _over_temperature(problem, options, slopes)
-    elif fits_registers(problem, options):
-        passed = _in_registers(problem, options)
-    else:
-        passed = _run(problem, options)
+    passed = (_in_registers if fits_registers(problem, options) else _run)(problem, options)
     attitude = passed.estimate.attitude
     if not np.isfinite(attitude[-1]).all():  # NaN persists
         end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
@@ -280,30 +273,6 @@ def fits_registers(problem: Problem, options: Options) -> bool:
     """Return whether the filter is that of attitude and bias in registers."""
     more = problem.model.states or options.judged or options.whole_bias
     return not more and problem.events.noise_by_axis is None
-
-
-def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Passed:
-    """Run the filter with a bias driven by temperature, in segments of nearly constant temperature."""
-    record, initial = problem.record, problem.initial
-    T = temperature.of(record)
-    state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
-    parts: list[Estimate] = []
-    before, begin = float(T[0]), 0
-    for span in _spans_of(problem):
-        for first, last, mean in temperature.stretches(cut(record, begin, span.last), options.every):
-            state = temperature.shifted(state, slopes, mean - before)
-            part, off = temperature.at_mean(cut(record, begin + first, begin + last), mean, state.values[slopes])
-            passed = _run(prepared(part, problem.process_noise, state, problem.error_states, driven=True), options)
-            parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
-            state, before = passed.end, mean
-        if span.change is not None:
-            at_edge = temperature.shifted(state, slopes, float(T[span.last]) - before)
-            state, before = changed(at_edge, span.change), float(T[span.last])
-        begin = span.last
-    end = temperature.shifted(state, slopes, float(T[-1]) - before)
-    estimate = joined(parts)
-    skipped = skipped_too(problem.events, estimate.innovations)
-    return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
 
 
 def gaps(record: ImuRecord) -> list[Event]:
@@ -323,28 +292,23 @@ def in_order(events: Sequence[Event]) -> tuple[Event, ...]:
     return tuple(sorted(events, key=lambda event: event.start))
 
 
-def _spans_of(problem: Problem) -> tuple[Span, ...]:
-    """Return the spans of a record; without any, the whole as one."""
-    return problem.spans or (Span(len(problem.record.increments)),)
-
-
 def _in_spans(
     problem: Problem, rows: Sequence[Array], body: six_states.Body | structure.Body
-) -> Iterator[tuple[slice, tuple[Any, ...], list[Array]]]:
-    """Yield the events, the kernel's first arguments and the rows to write for each span; then change the state.
+) -> Iterator[tuple[slice, slice, tuple[Any, ...], list[Array]]]:
+    """Yield intervals, events, the kernel's first arguments and the rows to write for each span; then change the state.
 
     ``rows``: arrays of the outputs with a row for each edge.
     """
     edges, increments = problem.gyro
     measured = problem.events.measurements
     first = before = 0
-    for last, change in _spans_of(problem):
+    for last, change in problem.spans or (Span(len(increments)),):
         after = int(np.searchsorted(measured.time, edges[last], side="right"))
         events = slice(before, after)
         columns = {name: getattr(measured, name)[events] for name in ("time", "place", "sensor")}
         at_first = [row[first : first + 1].copy() for row in rows]
         arguments = edges[first : last + 1], increments[first:last], measured._replace(**columns)
-        yield events, arguments, [row[first:] for row in rows]
+        yield slice(first, last), events, arguments, [row[first:] for row in rows]
         if first:
             for row, kept in zip(rows, at_first, strict=True):
                 row[first : first + 1] = kept
@@ -372,7 +336,7 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     out = six_states.Outputs._make((*written, segments[: options.segments]))
     body = body_in_registers(problem)
     state, number = body.state, 0
-    for _, arguments, part in _in_spans(problem, out[:-2], body):
+    for _, _, arguments, part in _in_spans(problem, out[:-2], body):
         out_of_part = six_states.Outputs._make((*part, *out[-2:]))
         number = compiled(walk, six_states)(*arguments, every, body, out_of_part)
         if number < 0:
@@ -596,10 +560,28 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
+        warming=_warming(problem),
+        warming_now=np.zeros(1),
         root=np.zeros(kernels.N**2),
     )
     put_state(body, initial)
     return body
+
+
+def _warming(problem: Problem) -> Array:
+    """Return the change of temperature over time in each interval (n,), K/s; empty without slopes of the bias."""
+    if not problem.model.structure.slopes:
+        return np.empty(0)
+    return np.asarray(np.diff(temperature_of(problem.record)) / problem.record.intervals)
+
+
+def temperature_of(record: ImuRecord) -> Array:
+    """Return the temperature of a record (n + 1,), °C."""
+    if record.temperature is None:
+        raise InputError(
+            "the record has no temperature, which drives the gyro's bias; give it, or leave the gyro temperature states out"
+        )
+    return record.temperature
 
 
 def aligned_zeros(*shape: int) -> Array:
@@ -628,8 +610,8 @@ def _run(problem: Problem, options: Options) -> Passed:
     if options.judged:
         judged = judge.outputs(out)
         weight = judged.weight
-    for at, arguments, part in _in_spans(problem, out[:-2], body):
-        form = body._replace(length=body.length[at], turning=body.turning[at])
+    for intervals, at, arguments, part in _in_spans(problem, out[:-2], body):
+        form = body._replace(length=body.length[at], turning=body.turning[at], warming=body.warming[intervals])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
             outputs = judged._replace(form=out_of_part)

@@ -10,8 +10,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.estimation import temperature
-from strapdown.estimation.error_states import Effect, ErrorStates, check, spans
+from strapdown.estimation.error_states import Effect, ErrorStates, check, spans, temperature_slopes
 from strapdown.estimation.states import State, check_arguments
 from strapdown.kernels.chains import CHAIN, chain_start
 from strapdown.kernels.measurement import KIND_CODES
@@ -153,7 +152,8 @@ def _assembled(
     kinds = dict(sensors_and_kinds)
     decay, density = _not_negative(blocks, "decay"), _not_negative(blocks, "density")
     offsets = _stack(blocks, "gyro_offset", (3,))
-    if generic and (slopes := temperature.slopes(blocks)) is not None:
+    slopes = temperature_slopes(blocks)
+    if generic and slopes is not None:
         offsets[slopes] = np.eye(3)
     scales, forces = _stack(blocks, "gyro_scale", (3, 3)), _stack(blocks, "gyro_force", (3, 3))
     force_f = _force(blocks, np.any(scales != 0.0, axis=(1, 2)) & np.any(forces != 0.0, axis=(1, 2)))
@@ -181,7 +181,9 @@ def _assembled(
         shapes = tuple(Sensor(code, isotropic, ()) for code in KIND_CODES.values())
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
     return Model(
-        structure=Structure(6 + len(decay), gyro, chains, vectors, shapes),
+        structure=Structure(
+            6 + len(decay), gyro, chains, vectors, shapes, 0 if generic or slopes is None else 6 + slopes.start
+        ),
         numbers=np.array(numbers.values or [0.0]),
         shape=np.array([shapes.index(sensor) for sensor in sensors], np.int64),
         decay=decay,

@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike
 from strapdown import kinematics, quaternion
 from strapdown.checks import Array, InputError, array, instance, non_negative, one_of
 from strapdown.estimation import model as modelling
-from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.error_states import ErrorStates, temperature_slopes
 from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import kernel_model
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
-from strapdown.estimation.temperature import need_none
 from strapdown.kernels import filter, machine
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
@@ -73,7 +72,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
         state = modelling.begin(initial, self.error_states)
-        need_none(self.error_states, "this filter")
+        refuse("this filter", temperature=temperature_slopes(self.error_states) is not None)
         if isinstance(sensors, str):
             raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
         affected = [sensor for block in self.error_states for sensor in block.effects]

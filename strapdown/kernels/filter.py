@@ -57,6 +57,7 @@ from strapdown.kernels.measurement import (
     frame_of,
     six_at,
     value_of,
+    vector_at,
 )
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import SQUARED_RANGE
@@ -123,6 +124,7 @@ CALLED = (
     "take_row",
     "inner_product",
     "fill_coefficients",
+    "warm",
     *(f"write_{s}" for s in range(len(STRUCTURE.sensors))),
 )
 """Called, not inlined, by other kernels: each copy would be compiled again. numba compiles them, so that what must be traced is a function
@@ -1527,12 +1529,36 @@ def longest_step(state, part, dt, body):
     return min(step_within(turn_squared(part, dt, bias_at(body, 0)), dt), body.model.limit)
 
 
+def increment_over(increments, k, body):
+    """Return the increment of interval k, zero for the interval before the first edge; set the change of temperature in the interval."""
+    if k < 0:
+        return (0.0, 0.0, 0.0)
+    if STRUCTURE.slopes:
+        body.warming_now[0] = body.warming[k]
+    return vector_at(increments, k)
+
+
 def propagate_row(body, i, part, dt, like):
-    """Propagate state i."""
+    """Propagate state i; a bias driven by temperature changes before and after by half the change of temperature."""
     if dt != body.dt[0]:
         fill_coefficients(body.coefficients, dt, body.model)
         body.dt[0] = dt
+    if STRUCTURE.slopes:
+        warm(body.x[i], body.P[i], 0.5 * dt * body.warming_now[0])
     advance(body.x[i], body.P[i], part, dt, body.model, body.coefficients, like)
+    if STRUCTURE.slopes:
+        warm(body.x[i], body.P[i], 0.5 * dt * body.warming_now[0])
+
+
+def warm(x, P, change):
+    """Change the gyro bias of one run by its slopes over temperature, ``b + c ΔT``."""
+    for i in range(3):
+        bias, slope = 3 + i, STRUCTURE.slopes + i
+        x[1 + bias] += change * x[1 + slope]
+        for j in range(N):
+            P[W * bias + j] += change * P[W * slope + j]
+        for j in range(N):
+            P[W * j + bias] += change * P[W * j + slope]
 
 
 def predict(state, part, dt, body, out):

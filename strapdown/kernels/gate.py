@@ -32,6 +32,7 @@ from strapdown.kernels.filter import (
     widen,
     write_row,
 )
+from strapdown.kernels.filter import increment_over as increment_of_filter
 from strapdown.kernels.gate_rules import (
     CANDIDATE,
     DROPPED,
@@ -131,6 +132,11 @@ class Outputs(NamedTuple):
 
 
 # ------------------------------------------------------------------------------------------------------------------ the body of the walk
+
+
+def increment_over(increments, k, body):
+    """Return the increment of interval k."""
+    return increment_of_filter(increments, k, body.form)
 
 
 def begin(body):

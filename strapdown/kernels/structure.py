@@ -64,6 +64,8 @@ class Structure(NamedTuple):
     vectors: tuple[tuple[int, int, int], ...]
     """States (x, y, z) that form a vector that is carried with the estimated attitude."""
     sensors: tuple[Sensor, ...]
+    slopes: int = 0
+    """First of the three slopes of the gyro bias over temperature; 0: none."""
 
 
 SIX_STATES = Structure(6, (), (), (), ())
@@ -133,6 +135,10 @@ class Body(NamedTuple):
     """Effect e of each error state on the gyro as an offset (m, 3), for the whole bias."""
     factors: np.ndarray = np.empty(0)
     """Factor on σ about each body axis of each sensor (sensors × 3 × runs), of runs that differ in noise."""
+    warming: np.ndarray = np.empty(0)
+    """Change of temperature over time in each gyro interval (n,), K/s; empty without slopes of the bias."""
+    warming_now: np.ndarray = np.empty(0)
+    """That in the present interval (1,)."""
     root: np.ndarray = np.empty(0)
     """Lines r of a root of P, ``P = Σ r rᵀ`` (N²), of one run."""
 

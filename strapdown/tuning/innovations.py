@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array
-from strapdown.estimation import forward, setup, temperature
+from strapdown.estimation import forward, setup
 from strapdown.estimation import model as modelling
-from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.error_states import ErrorStates, temperature_slopes
 from strapdown.estimation.forward import Problem
 from strapdown.estimation.model import Model
 from strapdown.estimation.schedule import Schedule
@@ -288,7 +288,7 @@ class Likelihood(Objective):
 
 def _slopes(blocks: Sequence[ErrorStates]) -> slice:
     """Return the places of the slopes of the gyro's bias over temperature among the error states; empty if there are none."""
-    return temperature.slopes(blocks) or slice(0, 0)
+    return temperature_slopes(blocks) or slice(0, 0)
 
 
 def _in_lanes(columns: Sequence[Array]) -> Array:
@@ -370,6 +370,6 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
             record, prepared.events, prepared.model, forward.unit_sigmas(record, prepared.model, {})
         ),
         turning=forward.turns(prepared),
-        warming=temperature.of(record) - temperature.of(record)[0] if hot else np.empty(0),
+        warming=forward.temperature_of(record) - forward.temperature_of(record)[0] if hot else np.empty(0),
         driven=np.array([g.offset[g.state - hot[0]][0] for g in model.structure.gyro if g.state in hot], np.int64),
     )
