@@ -21,7 +21,7 @@ from measured import (
 )
 
 from strapdown import estimation, kinematics, quaternion, records
-from strapdown.estimation import error_states, forward, recovery_segments
+from strapdown.estimation import error_states, forward
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.model import assemble
@@ -392,22 +392,6 @@ def lost_start(seed: int, duration: float = 2.5, blocks=(IRON,)):
 
 STILL = error_states.VectorBias(sensor="mag", bias_sigma=0.05)
 GATE = Gate(recovery=4, restart_bias_sigma=3e-3)
-
-
-def test_a_part_of_a_record_between_any_two_times():
-    record, _ = swaying()
-    mag = record.vectors[0]
-    begin, end = float(mag.time[2]), float(mag.time[7])
-    middle = 0.5 * (record.time[40] + record.time[41])
-    first, second = recovery_segments.part(record, begin, middle), recovery_segments.part(record, middle, end)
-    assert (first.time[0], first.time[-1], second.time[-1]) == (begin, middle, end)
-    edges = np.cumsum(np.vstack([np.zeros(3), record.increments]), axis=0)
-    turned = [np.interp([begin, middle, end], record.time, edges[:, i]) for i in range(3)]
-    whole = np.array([first.increments.sum(axis=0), second.increments.sum(axis=0)])
-    np.testing.assert_allclose(whole.T, np.diff(turned), rtol=0, atol=1e-15)
-    rows = [np.flatnonzero(~np.isnan(p.vectors[0].vector_b[:, 0])).tolist() for p in (first, second)]
-    assert rows == [[2, 3, 4, 5, 6][: len(rows[0])], [2, 3, 4, 5, 6][len(rows[0]) :]]
-    assert len(first.vectors[0].time) == len(mag.time)
 
 
 def test_what_is_smoothed_of_a_recovery_and_what_is_not():

@@ -9,7 +9,7 @@ tangent space.
 - ``gating``: Gate and robust weights.
 - ``schedule``: Measurements in order of time.
 - ``forward``: The filter over whole records.
-- ``smoothing``: The smoothers; ``recovery_segments``: smoothing across recoveries.
+- ``smoothing``: The smoothers.
 - ``observability``: Information of a record about each state.
 - ``features``: What filters of single samples and exported ones have not, with the remedy.
 - ``live``: The compiled filter for data in real time.

@@ -5,31 +5,30 @@ filter. Each correction of the attitude moves the filter's tangent space and its
 one tangent space to the next by the Jacobians of the rotation vector (:mod:`strapdown.kernels.smoother`, for six states
 :mod:`strapdown.kernels.smoother_loop`). To first order in the errors this is the least-squares estimate over the whole record.
 
-After a recovery of a gate, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), smoothed
-separately:
+A recovery of a gate divides the record, and no information crosses it, not even about the bias, for which the candidate has the σ given by
+:class:`strapdown.estimation.Gate`:
 
-- up to the first of the refusals that led to the recovery, from the measurements before it;
+- up to the first of the refusals that led to it, from the measurements before it;
 - from the start of the candidate that took over, from the measurements after it. That start usually is the first refusal, so that the
   interval in which the filter was wrong is estimated correctly;
-- any interval between the two, if candidates failed, is the filter's estimate, which is wrong there, as the event reports.
-
-No information crosses a recovery, not even about the bias, for which the candidate has the σ given by :class:`strapdown.estimation.Gate`.
+- any interval between the two, if candidates failed, from the measurements in it: it is wrong there, as the event reports.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.estimation import forward, recovery_segments
+from strapdown.estimation import forward
+from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
-from strapdown.estimation.forward import Options, Problem
+from strapdown.estimation.forward import Options, Passed, Problem, filtered, most_segments
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.recovery_segments import Break, Rerun
 from strapdown.estimation.states import (
     GateMemory,
     ProcessNoise,
@@ -38,10 +37,14 @@ from strapdown.estimation.states import (
     covariance_matrices,
 )
 from strapdown.kernels import smoother, smoother_loop, structure
+from strapdown.kernels.gate_rules import FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude, step_aside
 from strapdown.kernels.lane_values import WIDTH
-from strapdown.kernels.machine import compiled
-from strapdown.records import Estimate, Event, ImuRecord
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.smoother_loop import locate_edges
+from strapdown.records import Estimate, ImuRecord
 
+MAX_CUT = 64
+"""Maximum ratio of the number of sub-steps to that expected from the increments; above it the filter has diverged."""
 MIN_SMOOTHED = 1e-11
 """Minimum smoothed variance, relative to what a backward step subtracts, at which it keeps enough digits."""
 UPPER = np.triu_indices(6)
@@ -81,8 +84,7 @@ def smooth(
     -------
     Estimate
         Smoothed attitude, bias, error states and variances; at the last edge those of the filter. Innovations and events are the
-        filter's. After a recovery of a gate, if there is a lever arm among the error states, the second trajectory begins at the
-        recovery, and the rows from the first refusal to there are the filter's.
+        filter's.
 
     Notes
     -----
@@ -91,17 +93,16 @@ def smooth(
     """
     problem = forward.prepared(record, process_noise, initial, error_states)
     options = Options(
-        every=len(record.time),
         full_covariance=full_covariance,
         error_state_covariance=error_state_covariance,
         gate=gate,
         robust=robust,
     )
     if not problem.model.states:
-        estimate = _Smoother(problem, options, _SixStates(problem)).smoothed()
+        estimate = _estimate(problem, options, _SixStates)
         if _digits_kept(problem, estimate):
             return estimate
-    estimate = _Smoother(problem, options, _ManyStates(problem)).smoothed()
+    estimate = _estimate(problem, options, _ManyStates)
     lost = _digits_lost(problem, estimate)
     if lost is not None:
         raise InputError(
@@ -151,104 +152,115 @@ def _added_angle(problem: Problem) -> Array:
     return np.asarray(angle * dt + rate * dt**3 / 3.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Smoother:
-    """A record and the form of the covariance for smoothing it."""
+def _estimate(problem: Problem, options: Options, kind: type[_SixStates | _ManyStates]) -> Estimate:
+    """Return the estimate at every edge of a record."""
+    passed, outputs = _smoothed(problem, options, kind)
+    estimate = passed.estimate
+    return replace(
+        kind(problem).estimate(outputs, options),
+        innovations=estimate.innovations,
+        skipped=estimate.skipped,
+        events=estimate.events,
+    )
 
-    problem: Problem
-    options: Options
-    form: _SixStates | _ManyStates
 
-    def smoothed(self) -> Estimate:
-        """Return the estimate at every edge."""
-        record = self.problem.record
-        estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
-        event_time = self.problem.events.time
-        recovered = recovery_segments.recoveries(estimate.events)
-        edges = len(record.time)
-        outputs = self.form.outputs(edges, self.options)
-        starts = np.arange(edges)
-        if len(segments) > edges:  # some interval in several segments
-            starts = recovery_segments.starts(record.time, event_time, segments)
-        if recovered:
-            self._across_recoveries(*self._reruns(recovered, event_time, segments), segments, outputs)
-        else:
-            self.form.go_back(segments, starts, 0, outputs)
-        return replace(
-            self.form.estimate(outputs, self.options),
-            innovations=estimate.innovations,
-            skipped=estimate.skipped,
-            events=estimate.events,
-        )
+def _smoothed(
+    problem: Problem, options: Options, kind: type[_SixStates | _ManyStates], *, restarted: bool = False
+) -> tuple[Passed, list[Array]]:
+    """Return the filter's result over a record, and the smoothed states at its edges.
 
-    def _across_recoveries(
-        self, breaks: Sequence[Break], reruns: Sequence[Rerun], segments: Array, outputs: Sequence[Array]
-    ) -> None:
-        """Smooth each trajectory of a record, and write its rows."""
-        time = self.problem.record.time
-        stop = recovery_segments.stops(time, breaks)
-        first = recovery_segments.starts(stop, self.problem.events.time, segments)
-        for part in recovery_segments.trajectories(time, breaks, first, segments, reruns):
-            written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
-            smoothed = part.edge <= part.last
-            if smoothed.any():
-                self.form.go_back(part.segments, part.starts[: part.last + 1], part.edge[0], written)
-            for edge in part.edge[~smoothed]:  # the filter's own
-                self.form.go_back(part.segments, part.starts[: edge + 1], edge, written)
-            for out, there in zip(outputs, written, strict=True):
+    ``restarted``: whether the record starts with a candidate. Another one that starts there counts from its recovery only.
+    """
+    time, form, state = problem.record.time, kind(problem), problem.initial
+    passed, outputs = filtered_whole(problem, options), form.outputs(len(time), options)
+    recoveries = [event for event in passed.estimate.events if event.kind == "recovery"]
+    if not recoveries:
+        form.go_back(passed.segments, segment_starts(problem, passed.segments), 0, outputs)
+        return passed, outputs
+    event = min(recoveries, key=lambda event: event.end)
+    memory = filtered(_part(problem, time[0], event.end, state), replace(options, every=len(time))).end.gate
+    assert memory is not None
+    since = max(memory.counts[SINCE], time[0])
+    if restarted and since == time[0]:
+        since = event.end
+    for begin, end in itertools.pairwise((time[0], max(event.start, time[0]), since, time[-1])):
+        if end > begin:
+            if begin == since:
+                state = _candidate(problem, options, state, memory, since)
+            part, rows = _smoothed(_part(problem, begin, end, state), options, kind, restarted=begin == since)
+            state = part.end
+            edges = np.flatnonzero((time >= begin) & ((time < end) | (time == time[-1]) & (end == time[-1])))
+            skip = int(begin not in time)
+            for out, row in zip(outputs, rows, strict=True):
                 if len(out):
-                    out[part.row] = there[part.edge]
+                    out[edges] = row[skip : skip + len(edges)]
+    return passed, outputs
 
-    def _reruns(
-        self, recovered: Sequence[Event], event_time: Array, segments: Array
-    ) -> tuple[list[Break], list[Rerun]]:
-        """Return the breaks of a record, and for each the candidate that took over, from its start to the recovery.
 
-        With a lever arm, whose accelerations at the end of a part differ from those of the whole, a trajectory begins with the recovery.
-        """
-        record, gate = self.problem.record, self.options.gate
-        assert gate is not None
-        state = self.problem.initial
-        breaks: list[Break] = []
-        reruns: list[Rerun] = []
-        begin = float(record.time[0])
-        for event in recovered:
-            memory: GateMemory | None = None
-            if not self.problem.model.levers.any():
-                state = self._part(recovery_segments.part(record, begin, event.end), state, self.options).end
-                memory = state.gate
-                begin = event.end
-            gap = recovery_segments.break_of(event, memory, float(record.time[0]))
-            breaks.append(gap)
-            if memory is None or gap.since == gap.end:
-                reruns.append(None)
-                continue
-            bias, variance, counts = recovery_segments.restarted(gate, memory)
-            age = gap.since - memory.start
-            values, P = forward.aged_states(self.problem.model, memory.values, memory.covariance, age)
-            stop = recovery_segments.stops(record.time, [gap])
-            lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, gap.since)]
-            whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
-            whole[6:, 6:] = P
-            fresh = State(
-                attitude=segments[lost, 4:8],
-                bias=bias,
-                values=values,
-                covariance=whole,
-                gate=replace(memory, counts=counts),
-                unit_sigma=state.unit_sigma,
-            )
-            span = recovery_segments.part(record, gap.since, gap.end)
-            problem = forward.prepared(span, self.problem.process_noise, fresh, self.problem.error_states)
-            again = replace(self.options, every=len(span.time), gate=replace(gate, recovery=None))
-            _, rows = recovery_segments.filtered_whole(problem, again)
-            reruns.append((rows, recovery_segments.starts(span.time, problem.events.time, rows)))
-        return breaks, reruns
+def filtered_whole(problem: Problem, options: Options) -> Passed:
+    """Return the filter's result over a record with all its predictions (:attr:`strapdown.estimation.forward.Passed.segments`)."""
+    usual = most = most_segments(problem)
+    options = replace(options, every=len(problem.record.time), full_covariance=False)
+    while most <= MAX_CUT * usual:
+        # One row more than expected shows whether more were needed.
+        passed = filtered(problem, replace(options, segments=most + 1))
+        if len(passed.segments) - 1 <= most:
+            return passed
+        most *= (
+            4  # the number of sub-steps depends on the rotation without the bias, which is known only during the run
+        )
+    raise InputError(
+        "the filter diverged: with its estimate of the bias the body makes many rotations in each gyro interval; check the record and the "
+        "initial state with estimation.run first"
+    )
 
-    def _part(self, part: ImuRecord, state: State, options: Options) -> forward.Passed:
-        """Return the filter's pass over a part of the record."""
-        problem = forward.prepared(part, self.problem.process_noise, state, self.problem.error_states)
-        return forward.filtered(problem, replace(options, every=len(part.time), full_covariance=False))
+
+def segment_starts(problem: Problem, segments: Array) -> np.ndarray:
+    """Return the index of the segment that starts at each edge; the last row of segments is the end state."""
+    time = problem.record.time
+    first = np.arange(len(time))
+    if len(segments) > len(time):  # some interval in several segments
+        compiled(locate_edges)(read_only(time), problem.events.time, segments, len(segments) - 1, first)
+    return first
+
+
+def _part(problem: Problem, begin: float, end: float, initial: State) -> Problem:
+    """Return the part of a record between two times, with the measurements from ``begin`` on and before ``end``, or to the last edge."""
+    record, model = problem.record, problem.model
+    time = np.concatenate([[begin], record.time[(record.time > begin) & (record.time < end)], [end]])
+    k = np.searchsorted(record.time, time[1:], side="left") - 1
+    share = np.diff(time) / record.intervals[k]
+    before = np.nextafter(end, np.inf) if end == record.time[-1] else end
+
+    def inside(at: Array) -> np.ndarray:
+        return (at >= begin) & (at < before)
+
+    series = tuple(vectors.taken(inside(vectors.time)) for vectors in record.vectors)
+    part = ImuRecord(time=time, increments=share[:, None] * record.increments[k], vectors=series)
+    initial = replace(initial, unit_sigma=forward.unit_sigmas(record, model, initial.unit_sigma))
+    shorter = forward.prepared(part, problem.process_noise, initial, problem.error_states)
+    if not model.levers.any():
+        return shorter
+    events = problem.events.time
+    motion = problem.motion or turning(record, events)
+    return replace(shorter, motion=(motion[0][inside(events)], motion[1][inside(events)]))
+
+
+def _candidate(problem: Problem, options: Options, state: State, memory: GateMemory, since: float) -> State:
+    """Return a candidate at its start from the filter's state there and the gate's memory just before the candidate took over."""
+    assert options.gate is not None
+    counts = memory.counts.copy()
+    values, P = forward.aged_states(problem.model, memory.values, memory.covariance, since - memory.start)
+    sigma = restart_attitude(options.gate.restart_attitude_sigma, counts)
+    covariance = np.diag(
+        np.concatenate([np.full(3, sigma**2), counts[FIRST_BIAS + 3 : FIRST_BIAS + 6], np.zeros(len(P))])
+    )
+    covariance[6:, 6:] = P
+    bias = counts[FIRST_BIAS : FIRST_BIAS + 3].copy()
+    step_aside(counts)
+    counts[PASSES] = WIDE_PASSES
+    after = replace(memory, counts=counts, counters={}, candidate=None)
+    return replace(state, bias=bias, values=values, covariance=covariance, gate=after)
 
 
 @dataclass(frozen=True, eq=False)

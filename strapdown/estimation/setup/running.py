@@ -128,11 +128,10 @@ def run_modelled(
 def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array] | None:
     """Return what runs of setups that differ in noise have in common on a modelled record: the motion of a lever arm at the measurements.
 
-    None if the setup has no lever arm, or runs in segments of constant temperature.
+    None if the setup has no lever arm.
     """
     states = setup.states or States()
-    levers = any(np.any(sensor.lever_arm_sigma) for sensor in states.sensors.values())
-    if not levers or np.any(states.gyro_temperature_sigma):
+    if not any(np.any(sensor.lever_arm_sigma) for sensor in states.sensors.values()):
         return None
     return turning(record, schedule(record.vectors, record.time[0], record.time[-1]).time)
 
