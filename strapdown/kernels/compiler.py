@@ -23,7 +23,7 @@ from numba import types
 from numba.core import cgutils, datamodel, typed_passes, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.compiler_machinery import PassManager, _pass_registry, register_pass
+from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.cpu import CPUContext
 from numba.core.datamodel import models
 from numba.core.lowering import Lower
@@ -77,16 +77,6 @@ PASSES = (
     typed_passes.NoPythonBackend,
 )
 """The passes of numba that kernels need. Variables are not deleted after their last use: no references are counted."""
-
-
-class _Passes(PassManager):  # type: ignore[misc]
-    """Runs the passes one after the other; numba analyses and checks the whole function again after each."""
-
-    def run(self, state: Any) -> None:
-        for stage, _ in self.passes:
-            instance = _pass_registry.get(stage).pass_inst
-            instance.analysis = self._analysis
-            instance.run_pass(state)
 
 
 @contextmanager
@@ -233,7 +223,7 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
 
     def define_pipelines(self) -> list[PassManager]:
         """Return the only pipeline."""
-        passes = _Passes("kernel")
+        passes = PassManager("kernel")
         for stage in PASSES:
             passes.add_pass(stage, stage.__name__)
         passes.finalize()
