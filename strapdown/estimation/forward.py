@@ -330,7 +330,7 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     """Run the filter of attitude and bias, without a gate."""
     record, events, every = problem.record, problem.events, options.every
     rows = len(record.increments) // every + 1
-    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
+    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 36)
     written = [np.empty(shape) for shape in (*shapes, _innovations(events, judged=False))]
     segments = np.empty((options.segments + 1 if options.segments else 0, 32))
     out = six_states.Outputs._make((*written, segments[: options.segments]))
@@ -350,7 +350,7 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
         attitude=out.attitude,
         bias=out.bias,
         variance=out.variance,
-        covariance=covariance_matrices(out.covariance) if options.full_covariance else None,
+        covariance=out.covariance.reshape(-1, 6, 6) if options.full_covariance else None,
         innovations=innovations,
         skipped=skipped_too(events, innovations),
         events=in_order(gaps(record)),

@@ -186,7 +186,7 @@ class LiveFilter:
     def _outputs(self, n: int) -> Any:
         """Return the outputs of the kernels for n states, of which the innovations alone are used."""
         if not self._whole:
-            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 21))]
+            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 36))]
             return six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
         return structure.Outputs(
             x=np.empty((1, n + 1)),

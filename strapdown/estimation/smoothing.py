@@ -34,7 +34,6 @@ from strapdown.estimation.states import (
     ProcessNoise,
     State,
     covariance_blocks,
-    covariance_matrices,
 )
 from strapdown.kernels import smoother, smoother_loop, structure
 from strapdown.kernels.gate_rules import FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude, step_aside
@@ -271,18 +270,18 @@ class _SixStates:
 
     def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return arrays for the smoothed states."""
-        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 21)
+        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 36)
         return [np.empty(shape) for shape in shapes]
 
     def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
-        attitude, bias, variance, blocks = outputs
+        attitude, bias, variance, covariance = outputs
         return Estimate(
             time=self.problem.record.time,
             attitude=attitude,
             bias=bias,
             variance=variance,
-            covariance=covariance_matrices(blocks) if options.full_covariance else None,
+            covariance=covariance.reshape(-1, 6, 6) if options.full_covariance else None,
         )
 
     def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:

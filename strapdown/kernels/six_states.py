@@ -48,7 +48,7 @@ class Outputs(NamedTuple):
     bias: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """Blocks A, B, C (m, 21), or (0, 21)."""
+    """By rows (m, 36), or (0, 36)."""
     innovation: np.ndarray
     """e₁, s₁, e₂, s₂, e₃, s₃ (events, 4 or 6): independent innovations and their variances, as many as there are degrees of freedom."""
     segments: np.ndarray

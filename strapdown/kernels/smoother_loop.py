@@ -402,7 +402,7 @@ class Outputs(NamedTuple):
     bias: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """Blocks A, B, C (edges, 21), or (0, 21)."""
+    """By rows (edges, 36), or (0, 36)."""
 
 
 def smooth_back(segments, starts, first, angle_variance, rate_variance, work, out):

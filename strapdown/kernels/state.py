@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from strapdown.kernels.algebra import full
 from strapdown.kernels.lane_values import WIDTH, load, store
 
 SIZE = 28
@@ -25,13 +26,21 @@ def store_row(out, row, values):
         out[row, i] = value
 
 
+def covariance_rows(A, B, C):
+    """Return P by rows (36) from its blocks."""
+    A, C = full(A), full(C)
+    return sum((A[i : i + 3] + B[i : i + 3] for i in (0, 3, 6)), ()) + sum(
+        (B[i::3] + C[3 * i : 3 * i + 3] for i in (0, 1, 2)), ()
+    )
+
+
 def keep_state(out, row, q, b, A, B, C):
-    """Write a state to a row of the outputs: attitude, bias, variances, and, if the outputs have them, the blocks of the covariance."""
+    """Write a state to a row of the outputs: attitude, bias, variances, and, if the outputs have them, covariances by rows."""
     store_row(out.attitude, row, q)
     store_row(out.bias, row, b)
     store_row(out.variance, row, (A[0], A[3], A[5], C[0], C[3], C[5]))
     if row < len(out.covariance):
-        store_row(out.covariance, row, (*A, *B, *C))
+        store_row(out.covariance, row, covariance_rows(A, B, C))
 
 
 def load_triple(array, start):
