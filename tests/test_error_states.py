@@ -136,10 +136,14 @@ def test_both_faces_are_one_filter(option, body):
 
 def test_covariances_of_attitude_and_bias_alone_are_the_same():
     record, blocks = record_of(duration=2.0, anisotropic=True), OPTIONS["all"]
-    for pass_over in (lambda *data, **options: estimation.run_part(*data, **options)[0], estimation.smooth):
-        data = (record, NOISE, start(), blocks)
-        whole = pass_over(*data, full_covariance=True)
-        alone = pass_over(*data, full_covariance=True, error_state_covariance=False)
+    data = (record, NOISE, start(), blocks)
+    for whole, alone in (
+        (estimation.run(*data, full_covariance=True), forward.run_spans(*data, [forward.Span(len(record.increments))])),
+        (
+            estimation.smooth(*data, full_covariance=True),
+            estimation.smooth(*data, full_covariance=True, error_state_covariance=False),
+        ),
+    ):
         assert whole.whole_covariance is not None
         assert alone.whole_covariance is None
         np.testing.assert_array_equal(alone.covariance, whole.covariance)

@@ -181,7 +181,6 @@ def run_part(
     *,
     every: int = 1,
     full_covariance: bool = False,
-    error_state_covariance: bool = True,
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> tuple[Estimate, State]:
@@ -194,16 +193,8 @@ def run_part(
     the root mean square σ there (``unit_sigma`` of the state). A run over the whole record refers to that of the whole record, and so has
     another prior, unless ``initial`` has the same one. With a lever arm parts agree only to about 1e-6 of their estimates: the angular
     acceleration is computed from the gyro samples around each measurement, at a cut from those on one side.
-
-    If ``error_state_covariance`` is false, whole covariances are those of attitude and bias only, which saves a tenth of the time.
     """
-    options = Options(
-        every=count("every", every),
-        full_covariance=full_covariance,
-        error_state_covariance=error_state_covariance,
-        gate=gate,
-        robust=robust,
-    )
+    options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
     passed = filtered(prepared(record, process_noise, initial, error_states, driven=True), options)
     return passed.estimate, passed.end
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -130,10 +130,10 @@ class Schedule:
 def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) -> Schedule:
     """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped."""
     parts = [_scheduled(series, start, end) for series in vectors]
-    bounds = np.array([0, *accumulate(len(part.time) for part in parts)])
+    bounds = np.array([0, *accumulate(len(part.series.time) for part in parts)])
     first_frames = [0, *accumulate(len(part.frames) for part in parts)]
     return Schedule(
-        series_time=tuple(read_only(part.time) for part in parts),
+        series_time=tuple(read_only(part.series.time) for part in parts),
         series_vector_b=tuple(read_only(part.value) for part in parts),
         series_sigma=tuple(read_only(part.sigma) for part in parts),
         noise_by_axis=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
@@ -145,7 +145,7 @@ def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) 
         triads=_joined([part.frames for part in parts], (0, 9)),
         sensors=tuple(series.sensor for series in vectors),
         kinds=tuple(series.kind for series in vectors),
-        skipped={s.sensor: len(s.time) - len(part.time) for s, part in zip(vectors, parts, strict=True)},
+        skipped={s.sensor: len(s.time) - len(part.series.time) for s, part in zip(vectors, parts, strict=True)},
     )
 
 
@@ -156,18 +156,16 @@ def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:
     return np.concatenate(columns) if columns else np.empty(empty)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Part:
+class _Part(NamedTuple):
     """The usable measurements of one series."""
 
-    time: Array
+    series: VectorMeasurements
     value: Array
     sigma: Array
     moving: bool
     """Whether the reference changes between measurements."""
     frames: Array
     """(rows, 9)."""
-    series: VectorMeasurements
     length: Array | float = 1.0
     """Lengths of the references of whole vectors."""
 
@@ -192,14 +190,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
         assert used.sigma_axes is not None
         frames = np.zeros((len(used.time), 9))
         frames[:, :4] = used.attitude
-        return _Part(
-            time=used.time,
-            value=used.sigma_axes**2,
-            sigma=used.sigma,
-            moving=True,
-            frames=frames,
-            series=used,
-        )
+        return _Part(used, used.sigma_axes**2, used.sigma, True, frames)
     moving = used.reference_f.ndim == 2
     value, sigma = used.vector_b, used.sigma
     length: Array | float = 1.0
@@ -207,15 +198,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
         # A vector is divided by the length of its reference, so that the kernel sees unit references only.
         length = np.asarray(np.linalg.norm(used.reference_f, axis=-1))
         value, sigma = value / (length[:, None] if moving else length), sigma / length
-    return _Part(
-        time=used.time,
-        value=value,
-        sigma=sigma,
-        moving=moving,
-        frames=triad(used.reference_f).reshape(-1, 9),
-        series=used,
-        length=length,
-    )
+    return _Part(used, value, sigma, moving, triad(used.reference_f).reshape(-1, 9), length)
 
 
 def _need_noise(series: VectorMeasurements) -> None:

@@ -32,8 +32,11 @@ from strapdown.kernels.filter_step import transition
 from strapdown.kernels.measurement import HEADING, KIND, Measurements, six_at, vector_at
 from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.structure import Model
-from strapdown.kernels.walk import increment_over  # noqa: F401 - that of the walk, not the filter's
-from strapdown.kernels.walk import step_within, turn_squared
+from strapdown.kernels.walk import (
+    increment_over,  # noqa: F401 - that of the walk, not the filter's
+    step_within,
+    turn_squared,
+)
 
 CALLED = ("correct_source", "propagate_source", "put_rows", "transform")
 

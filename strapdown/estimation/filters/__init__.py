@@ -37,7 +37,6 @@ def compare(
     *,
     filters: Iterable[str | OwnFilter | Callable[[ImuRecord, State], Estimate]],
     every: int = 1,
-    full_covariance: bool = False,
     bound: ArrayLike | None = None,
 ) -> Comparison:
     """Run several filters over one record.
@@ -53,7 +52,7 @@ def compare(
         As for :func:`strapdown.estimation.run`; a filter of your own does not get ``process_noise``.
     filters : iterable of str or filter
         ``"mekf"``, the package's, and filters of your own (:mod:`strapdown.estimation.filters.own`).
-    every, full_covariance : int, bool
+    every : int
         As for :func:`strapdown.estimation.run`.
     bound : array_like (n, 6, 6), optional
         Cramér–Rao bound at the stored edges (:attr:`strapdown.covariance.Analysis.cramer_rao`): errors are compared with its root.
@@ -83,7 +82,7 @@ def compare(
     estimates = {
         name: estimator(record, initial, times=record.time[::every])
         if isinstance(estimator, Own)
-        else forward.run(record, process_noise, initial, every=every, full_covariance=full_covariance)
+        else forward.run(record, process_noise, initial, every=every)
         for name, estimator in zip(names, estimators, strict=True)
     }
     truth = record.truth

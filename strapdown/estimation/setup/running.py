@@ -182,7 +182,7 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
     if not states.gyro_drift_sigma:
         return estimation.smooth(record, setup.process_noise, initial, blocks, **judging)
     start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
-    full, of_all = bool(judging.pop("full_covariance", False)), bool(judging.pop("error_state_covariance", True))
+    full = bool(judging.pop("full_covariance", False))
     smoothed = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **judging)
     assert smoothed.whole_covariance is not None
     offsets = _offsets(blocks)
@@ -195,7 +195,7 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
         + np.concatenate([block.values for block in smoothed.error_states.values()], axis=1) @ offsets.T,
         variance=np.einsum("kii->ki", covariance).copy(),
         covariance=covariance if full else None,
-        whole_covariance=smoothed.whole_covariance if full and of_all else None,
+        whole_covariance=smoothed.whole_covariance if full else None,
     )
 
 
