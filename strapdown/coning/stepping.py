@@ -21,7 +21,6 @@ from strapdown.kernels.integration import (
     accumulate_quaternions,
     accumulate_vectors,
     compressed_vectors,
-    one_sample_vectors,
     pair_vectors,
 )
 from strapdown.kernels.machine import compiled
@@ -210,11 +209,7 @@ def _vectors(increments: Array, table: Algorithm) -> Array:
         # The first steps use later increments instead of previous ones; for a record too short for that, a smaller p is used.
         previous = min(table.previous, max(0, len(increments) - table.samples) // 2)
         coefficients = _compressed_array(table, previous)
-        flat, rows = increments.reshape(-1), vectors.reshape(-1)
-        if table.samples == 1:
-            compiled(one_sample_vectors)(flat, coefficients, rows)
-        else:
-            compiled(compressed_vectors)(flat, coefficients, table.samples, rows)
+        compiled(compressed_vectors)(increments.reshape(-1), coefficients, table.samples, vectors.reshape(-1))
     else:
         short = len(increments) < table.window
         tables = pair_tables(table.samples, len(increments), {}) if short else table.pair_arrays

@@ -192,36 +192,6 @@ def compressed_vectors(increments, coefficients, samples, vectors):
         vectors[3 * k + 2] = phi[2]
 
 
-def one_sample_vectors(increments, coefficients, vectors):
-    """Do what compressed_vectors does for steps of one sample, faster: each lag is one pass over flat arrays, block by block."""
-    reach = len(coefficients)
-    compressed_vectors(increments[: 6 * reach], coefficients, 1, vectors[: 3 * reach])
-    for start in range(3 * reach, len(vectors), 3 * BLOCK):
-        end = min(start + 3 * BLOCK, len(vectors))
-        newest = increments[start:end]
-        others = vectors[start:end]
-        others[:] = 0.0
-        for j in range(reach):
-            add_scaled(coefficients[j], increments[start - 3 * (j + 1) : end - 3 * (j + 1)], others)
-        for k in range(len(others) // 3):
-            row = 3 * k
-            x = newest[row]
-            y = newest[row + 1]
-            z = newest[row + 2]
-            a = others[row]
-            b = others[row + 1]
-            c = others[row + 2]
-            others[row] = x + (b * z - c * y)
-            others[row + 1] = y + (c * x - a * z)
-            others[row + 2] = z + (a * y - b * x)
-
-
-def add_scaled(s, a, b):
-    """Add s a to b."""
-    for i in range(len(b)):
-        b[i] += s * a[i]
-
-
 def pair_vectors(increments, samples, previous, tables, vectors):
     """Write the rotation vectors φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j of all steps, Σ Δθ_i over the step, the products over its window.
 
