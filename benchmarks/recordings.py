@@ -55,24 +55,24 @@ def samples(recording: Recording) -> tuple[float, list[Array]]:
     return recording.interval, [np.ascontiguousarray(x) for x in sensors if x is not None]
 
 
-def vqf(recording: Recording, *, offline: bool = False) -> tuple[Array, None]:
-    """Return the attitude of VQF, with a magnetometer 9D, or of offline VQF."""
+def vqf(recording: Recording, *, offline: bool = False, gain: float = 1.0) -> tuple[Array, None]:
+    """Return the attitude of VQF, with a magnetometer 9D, or of offline VQF; the gain divides the time constants of VQF."""
     from vqf import VQF, offlineVQF
 
     interval, sensors = samples(recording)
     name = "quat9D" if len(sensors) == 3 else "quat6D"
     if not offline:
-        return np.asarray(VQF(interval).updateBatch(*sensors)[name]), None
+        return np.asarray(VQF(interval, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(*sensors)[name]), None
     return np.asarray(offlineVQF(*sensors, *([None] * (3 - len(sensors))), interval)[name]), None
 
 
-def imufusion(recording: Recording) -> tuple[Array, None]:
-    """Return the attitude of imufusion with the settings of its documentation."""
+def imufusion(recording: Recording, *, gain: float = 1.0) -> tuple[Array, None]:
+    """Return the attitude of imufusion with the settings of its documentation, the gain a multiple of theirs."""
     from imufusion import CONVENTION_ENU, Ahrs, AhrsSettings
 
     interval, (rate, force, *field) = samples(recording)
     settings = AhrsSettings()
-    settings.sample_rate, settings.convention, settings.gain = 1.0 / interval, CONVENTION_ENU, 0.5
+    settings.sample_rate, settings.convention, settings.gain = 1.0 / interval, CONVENTION_ENU, 0.5 * gain
     settings.gyroscope_range, settings.rejection_timeout = 2000.0, 5.0
     settings.acceleration_rejection = settings.magnetic_rejection = 10.0
     ahrs = Ahrs()
@@ -85,12 +85,16 @@ def imufusion(recording: Recording) -> tuple[Array, None]:
     return attitude, None
 
 
-def madgwick(recording: Recording) -> tuple[Array, None]:
-    """Return the attitude of Madgwick's filter (package ``ahrs``)."""
+def madgwick(recording: Recording, *, gain: float = 1.0) -> tuple[Array, None]:
+    """Return the attitude of Madgwick's filter (package ``ahrs``), East-North-Up; the gain is a multiple of its default."""
     from ahrs.filters import Madgwick
 
     interval, sensors = samples(recording)
-    return np.asarray(Madgwick(**dict(zip(("gyr", "acc", "mag"), sensors, strict=False)), Dt=interval).Q), None
+    named = dict(zip(("gyr", "acc", "mag"), sensors, strict=False))
+    default = 0.041 if "mag" in named else 0.033
+    quarter = Rotation.from_rotvec([0.0, 0.0, 0.5 * np.pi])  # its own x axis points North
+    own = Rotation.from_quat(Madgwick(**named, Dt=interval, gain=gain * default).Q, scalar_first=True)
+    return np.asarray((quarter * own).as_quat(scalar_first=True)), None
 
 
 FILTERS: dict[str, tuple[str, Filter]] = {
