@@ -1,10 +1,8 @@
 """Run the package against published figures and write ``docs/_data/validation.json``, which the page *Validation* prints.
 
-    python docs/validation.py [--runs 100] [--broad results/hand_held/hand_held.json]
+    python docs/validation.py [--runs 100]
 
 Only the published figures are written by hand, each beside its source; everything else is what the runs gave. It takes about a minute.
-``--broad`` adds the figures of ``python sims/hand_held.py --out results/hand_held RECORDING...`` on the BROAD recordings; without it those
-of the last file stay. The README's rows are those of the same file, which a test holds them to.
 """
 
 from __future__ import annotations
@@ -216,35 +214,8 @@ def ukfm(runs: int) -> dict[str, Any]:
     }
 
 
-def broad(path: Path) -> dict[str, Any]:
-    """Return the mean errors by filter from the file that ``sims/hand_held.py`` wrote about BROAD recordings."""
-    published = json.loads(path.read_text(encoding="utf-8"))
-    scores = {
-        treatment: {
-            name: [float(x) for x in np.mean([recording["errors"] for recording in each], axis=0) / DEGREE]
-            for name, each in published["scores"][treatment].items()
-        }
-        for treatment in ("as recorded", "compensated")
-    }
-    as_recorded = published["scores"]["as recorded"]
-    coverage = {
-        name: np.array([recording["coverage"] for recording in as_recorded[name]])
-        for name in ("strapdown", "strapdown, smoother")
-    }
-    return {
-        "recordings": published["recordings"],
-        "latency_ms": published["latency_ms"],
-        "errors_deg": scores,
-        "coverage": {
-            name: {"mean": each.mean(axis=0).tolist(), "least": each.min(axis=0).tolist()}
-            for name, each in coverage.items()
-        },
-    }
-
-
-def main(runs: int = 100, broad_file: Path | None = None, out: Path = OUT) -> dict[str, Any]:
+def main(runs: int = 100, out: Path = OUT) -> dict[str, Any]:
     """Run everything and write it to ``out``."""
-    before = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     result = {
         "version": strapdown.__version__,
         "date": datetime.date.today().isoformat(),
@@ -255,7 +226,6 @@ def main(runs: int = 100, broad_file: Path | None = None, out: Path = OUT) -> di
         "farrenkopf": farrenkopf(),
         "allan": allan_values(),
         "ukfm": ukfm(runs),
-        "broad": broad(broad_file) if broad_file else before.get("broad"),
     }
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -265,5 +235,4 @@ def main(runs: int = 100, broad_file: Path | None = None, out: Path = OUT) -> di
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100, help="of the attitude benchmark")
-    parser.add_argument("--broad", dest="broad_file", type=Path, help="hand_held.json of sims/hand_held.py")
     main(**vars(parser.parse_args()))

@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-import strapdown
+import strapdown as sd
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, quaternion
 from strapdown.ahrs import AhrsParameters, estimating, regions, remarks, starting
@@ -696,7 +696,7 @@ def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
 def test_a_motion_that_does_not_suit_is_warned_of(motion, said, smooth):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ahrs.MotionWarning)
-        estimate = (strapdown.smooth if smooth else strapdown.estimate)(driven(), motion=motion)
+        estimate = (sd.smooth if smooth else sd.estimate)(driven(), motion=motion)
     words = [str(warning.message) for warning in caught if warning.category is ahrs.MotionWarning]
     assert len(words) == said
     assert any("lasts longer than modelled" in remark for remark in estimate.remarks) == said
@@ -1067,10 +1067,13 @@ def test_the_accelerometers_own_error_is_part_of_the_tilts_sigma(smooth):
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     whole = hand_held.simulated(1, 0, 20.0)
     moving = hand_held.modified(whole)["no rest"]
-    result, score = hand_held.ours(moving, 0.0)
+    result = ahrs.estimate(moving, latency=0.0, full_covariance=True)
     assert np.sqrt(result.initial.covariance[0, 0]) > 6.0 * DEGREE
-    assert score.coverage[0] > 0.9
-    assert score.errors[0] < 15.0 * DEGREE
+    total = consistency.accuracy.accuracy(result.estimate, Truth.of_reference(moving.true_attitude)).given[
+        "all samples"
+    ]["total"]
+    assert total.coverage > 0.9
+    assert total.rms < 15.0 * DEGREE
 
 
 def test_the_tilt_of_starts_in_motion_is_as_uncertain_as_it_is_wrong():
@@ -1096,9 +1099,9 @@ trial = functools.cache(read)
 
 
 @functools.cache
-def score(file: Path, smooth: bool) -> hand_held.Score:
-    """Score of a trial as recorded."""
-    return hand_held.ours(trial(file), None, smooth=smooth)[1]
+def estimated(file: Path, smooth: bool) -> Estimate:
+    """The estimate of a trial as recorded, with its reference."""
+    return (sd.smooth if smooth else sd.estimate)(trial(file), full_covariance=True)
 
 
 def test_mean_error_over_the_broad_trials(broad):
@@ -1124,16 +1127,19 @@ def test_sigma_holds_on_broad_trials(broad):
     """The 95 % regions, as recorded, of the fastest trials, whose delays matter most."""
     for number in ("07", "21"):
         for smooth in (False, True):
-            accuracy = score(next(broad.glob(f"{number}_*.hdf5")), smooth)
-            assert accuracy.coverage[0] > 0.9, (number, smooth, accuracy)
+            estimate = estimated(next(broad.glob(f"{number}_*.hdf5")), smooth)
+            total = sd.accuracy(estimate).given["movement"]["total"]
+            assert total.coverage > 0.9, (number, smooth, total)
             # Of a σ that is right, the errors, that of the heading of the whole recording included, are as large as it.
-            assert 0.25 < accuracy.errors[0] / accuracy.sigma < 1.25, (number, smooth, accuracy)
+            variance = estimate.variance[estimate.truth.movement, :3].sum(axis=1).mean()
+            assert 0.25 < total.rms / np.sqrt(variance) < 1.25, (number, smooth, total)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
     """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
-    held = [score(file, smooth).coverage[2] for file in sorted(broad.glob("*.hdf5"))]
+    files = sorted(broad.glob("*.hdf5"))
+    held = [sd.accuracy(estimated(file, smooth)).given["movement"]["inclination"].coverage for file in files]
     assert 0.92 < np.mean(held) < 0.995, held
     assert min(held) > 0.8, held
 
@@ -1274,7 +1280,8 @@ def test_an_accelerometer_that_errs_slowly_has_a_less_certain_tilt(smooth):
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
-    nis = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
+    held = [estimated(file, False).innovations["accelerometer"] for file in sorted(broad.glob("*.hdf5"))]
+    nis = [np.mean(innovations.nis) / 3.0 for innovations in held]
     assert 0.1 < min(nis) < max(nis) < 0.9, nis
 
 
