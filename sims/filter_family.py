@@ -10,8 +10,8 @@ One tumbling body, a MEMS gyro, and four cases:
 
 The filters are the package's MEKF, and others as short filters of one's own, in NumPy. All run on the same records from the same initial
 states. Run
-``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all for the unscented filter). It prints a table and the
-findings for each case, and writes both with the figure and ``filter_family.json``.
+``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all for the unscented filter). It prints a table, and
+writes it with the figure and ``filter_family.json``.
 
 Definitions of the error. All Kalman filters have the same gains, in different coordinates. They differ in the step after an update: in the
 body-side terms of the package, after an attitude correction a the covariance of (δθ, δb) is transformed by G:
@@ -45,7 +45,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,8 +60,10 @@ from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.kinematics import right_jacobian, skew
 from strapdown.motion import Harmonic, HarmonicRates
+from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
+from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario, simulate
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 from strapdown.vectors import AttitudeSensor, Sensor, VectorMeasurements, VectorSensor, triad
@@ -91,8 +93,8 @@ COLOURS = {
     "usque": plots.PURPLE,
     "mahony": plots.GREEN,
 }
-DASHES = {"two-frame": (0, (5, 2, 1, 2))}
-"""Filters whose lines nearly coincide with another's."""
+LOOKS = {"two-frame": {"linestyle": (0, (5, 2, 1, 2)), "zorder": 3, "linewidth": 1.1}}
+"""Of lines that nearly coincide with another's."""
 
 
 # Filters of one's own
@@ -357,59 +359,33 @@ class Outcome:
     """NEES of all six states of each run (runs, m), per degree of freedom."""
 
     @property
-    def runs(self) -> int:
-        """Number of independent runs."""
-        return len(self.error)
-
-    @property
-    def converged(self) -> float:
-        """Fraction of the runs that are converged at the end."""
-        return float(np.mean(self.error[:, -1] < CONVERGED))
-
-    @property
-    def convergence_time(self) -> float:
-        """Time from which on 90 % of the runs are converged, s; NaN if never."""
-        slowest = np.quantile(self.error, 0.9, axis=0)
-        first = np.where(slowest > CONVERGED, np.arange(1, 1 + len(self.time)), 0).max()
-        return float(np.append(self.time, np.nan)[first])
-
-    @property
-    def final_rms(self) -> float:
-        """Root mean square error of attitude at the end, rad."""
-        return float(np.sqrt(np.mean(self.error[:, -1] ** 2)))
-
-    @property
     def anees(self) -> Array:
         """Mean NEES over the runs (m,), 1 for a consistent filter."""
         return np.asarray(self.nees.mean(axis=0))
 
-    @property
-    def anees_at_first(self) -> float:
-        """Mean NEES ten seconds after the start, which still shows the effect of the first corrections."""
-        return float(self.anees[min(int(np.searchsorted(self.time, 10.0)), len(self.time) - 1)])
-
     def summary(self) -> dict[str, Any]:
-        """Return the results as plain values for JSON; times that do not exist are None."""
-        low, high = consistency.mean_bounds(6, self.runs)
-        within = self.convergence_time
+        """Return the results as plain values for JSON; a convergence that does not happen is None.
+
+        Converged is a filter from when on 90 % of the runs are below 3°; consistent, if the ANEES is within its joint two-sided 99 % bounds
+        at five epochs of the second half. The ANEES at 10 s still shows the effect of the first corrections.
+        """
+        runs, m = self.error.shape
+        slow = np.flatnonzero(np.quantile(self.error, 0.9, axis=0) > CONVERGED)
+        first = slow[-1] + 1 if len(slow) else 0
+        epochs = np.linspace(m // 2, m - 1, 5).astype(int)
+        verdict = consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=runs, probability=0.99)
         return {
             "case": self.case,
             "filter": self.filter,
-            "runs": self.runs,
-            "converged": self.converged,
-            "convergence_time_s": within if np.isfinite(within) else None,
-            "final_rms_deg": self.final_rms / DEGREE,
-            "anees_at_10_s": self.anees_at_first,
+            "runs": runs,
+            "converged": float(np.mean(self.error[:, -1] < CONVERGED)),
+            "convergence_time_s": float(self.time[first]) if first < m else None,
+            "final_rms_deg": float(np.sqrt(np.mean(self.error[:, -1] ** 2))) / DEGREE,
+            "anees_at_10_s": float(self.anees[min(int(np.searchsorted(self.time, 10.0)), m - 1)]),
             "anees_at_end": float(self.anees[-1]),
-            "anees_bounds": [low, high],
-            "consistent": self.consistent,
+            "anees_bounds": list(consistency.mean_bounds(6, runs)),
+            "consistent": verdict.consistent,
         }
-
-    @property
-    def consistent(self) -> bool:
-        """Whether the ANEES is within its joint two-sided 99 % bounds at five epochs of the second half."""
-        epochs = np.linspace(len(self.time) // 2, len(self.time) - 1, 5).astype(int)
-        return consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=self.runs, probability=0.99).consistent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -417,11 +393,6 @@ class Result:
     """Results of the study."""
 
     outcomes: tuple[Outcome, ...]
-    figures: tuple[Path, ...]
-
-    def outcome(self, case: str, name: str) -> Outcome:
-        """Return the outcome of one filter in one case."""
-        return next(o for o in self.outcomes if (o.case, o.filter) == (case, name))
 
 
 def scenario(case: str, duration: float) -> Scenario:
@@ -499,106 +470,57 @@ def _pointing_error(attitude: Array, truth: Array) -> Array:
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(estimated, true), axis=-1), np.sum(estimated * true, axis=-1)))
 
 
+TITLES = {
+    "small": "initial error 1° per axis",
+    "large": "initial error 60° to 150°",
+    "one direction": "60° to 150°, one direction only",
+    "tracker": "60° to 150°, star tracker",
+}
+
+
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     """Draw error and ANEES over time, one column per case, and write the figure."""
     cases = list(dict.fromkeys(o.case for o in outcomes))
     figure, grid = plots.new_figure(2, len(cases), size=(2.8 * len(cases), 6.2), squeeze=False, sharex=True)
-    titles = {
-        "small": "initial error 1° per axis",
-        "large": "initial error 60° to 150°",
-        "one direction": "60° to 150°, one direction only",
-        "tracker": "60° to 150°, star tracker",
-    }
-    for column, case in enumerate(cases):
-        top, bottom = grid[:, column]
-        mine = [o for o in outcomes if o.case == case]
-        most = max(o.runs for o in mine)
-        for o in mine:
-            fewer = f", {o.runs} {'run' if o.runs == 1 else 'runs'}" if o.runs < most else ""
-            style: dict[str, Any] = {"color": COLOURS[o.filter], "label": o.filter + fewer, "linewidth": 1.4}
-            if o.filter in DASHES:
-                style.update(linestyle=DASHES[o.filter], zorder=3, linewidth=1.1)
-            top.plot(o.time, np.quantile(o.error, 0.9, axis=0) / DEGREE, **style)
-            bottom.plot(o.time, o.anees, **style)
-        low, high = consistency.mean_bounds(6, most)
-        bottom.axhspan(low, high, color="0.85", zorder=0, label=f"99 % bounds of {most} runs")
+    most = max(len(o.error) for o in outcomes)
+    for (top, bottom), case in zip(grid.T, cases, strict=True):
+        for o in outcomes:
+            if o.case == case:
+                runs = f", {len(o.error)} runs" if len(o.error) < most else ""
+                look: dict[str, Any] = {"color": COLOURS[o.filter], "label": f"{o.filter}{runs}", "linewidth": 1.4}
+                look |= LOOKS.get(o.filter, {})
+                top.plot(o.time, np.quantile(o.error, 0.9, axis=0) / DEGREE, **look)
+                bottom.plot(o.time, o.anees, **look)
+        bounds = consistency.mean_bounds(6, most)
+        bottom.axhspan(*bounds, color="0.85", zorder=0, label=f"99 % bounds of {most} runs")
         top.axhline(CONVERGED / DEGREE, color="0.5", linewidth=0.8, linestyle=":")
         bottom.plot([], [], color="0.5", linewidth=0.8, linestyle=":", label=f"{CONVERGED / DEGREE:g}°: converged")
-        top.set(yscale="log", title=titles[case])
-        least, greatest = top.get_ylim()
-        steps = (1.0, 2.0, 5.0) if greatest < 100.0 * least else (1.0,)
-        ticks = [
-            step * 10.0**decade for decade in range(-4, 4) for step in steps if least < step * 10.0**decade < greatest
-        ]
-        top.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-        top.tick_params(axis="y", which="minor", labelleft=False)
+        style.log_scale(top)
+        top.set_title(TITLES[case])
         scale = "linear" if case == "small" else "log"
         bottom.set(yscale=scale, xlabel="time, s")
         bottom.set_title(f"{scale} scale", loc="right", fontsize="small")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
     grid[1, 0].set_ylabel("ANEES / 6")
-    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    style.legend_below(figure, [grid[1, 0]], ncols=5)
     return plots.save(figure, path)
 
 
-def table(result: Result) -> str:
-    """Return the figures as text."""
-    lines = [
-        f"{'case':14s} {'filter':16s} {'runs':>5s} {'converged':>9s} {'in, s':>7s} {'final RMS, °':>12s} "
-        f"{'ANEES/6 at 10 s':>15s} {'at the end':>10s}  99 %"
-    ]
-    for o in result.outcomes:
-        within = f"{o.convergence_time:.0f}" if np.isfinite(o.convergence_time) else "never"
-        lines.append(
-            f"{o.case:14s} {o.filter:16s} {o.runs:5d} {100.0 * o.converged:7.0f} % {within:>7s} "
-            f"{o.final_rms / DEGREE:12.3f} {o.anees_at_first:15.3g} {o.anees[-1]:10.3g}  "
-            f"{'inside' if o.consistent else 'outside'}"
-        )
-    return "\n".join(lines)
-
-
-def findings(result: Result) -> list[str]:
-    """Return the findings for each case, over the runs common to all filters."""
-    lines = []
-    for case in dict.fromkeys(o.case for o in result.outcomes):
-        whole = [o for o in result.outcomes if o.case == case]
-        common = min(o.runs for o in whole)
-        mine = [dataclasses.replace(o, error=o.error[:common], nees=o.nees[:common]) for o in whole]
-        quick = [o for o in mine if np.isfinite(o.convergence_time)]
-        parts = [f"most accurate at the end: {_least(mine, lambda o: o.final_rms, lambda x: f'{x / DEGREE:.2f}°')}"]
-        if case != "small" and quick:
-            parts.insert(0, f"fastest to {CONVERGED / DEGREE:g}°: {_least(quick, _settling, lambda x: f'{x:.0f} s')}")
-        never = [o.filter for o in mine if o.converged < 0.9]
-        if never:
-            parts.append(f"converged in fewer than 90 % of the runs: {', '.join(never)}")
-        right = [o.filter for o in whole if o.consistent]
-        said = "all" if len(right) == len(whole) else ", ".join(right) or "none"
-        parts.append(f"consistent (ANEES inside its bounds in the second half): {said}")
-        wrong = sorted((o for o in whole if not o.consistent), key=_misjudged)
-        if wrong:
-            others = ", ".join(f"{o.filter} {_late_anees(o):.3g}" for o in wrong)
-            parts.append(f"mean ANEES/6 of the others there: {others}")
-        lines.append(f"{case} ({common} {'run' if common == 1 else 'runs'}): {'; '.join(parts)}.")
-    return lines
-
-
-def _settling(outcome: Outcome) -> float:
-    return outcome.convergence_time
-
-
-def _late_anees(outcome: Outcome) -> float:
-    return float(np.mean(outcome.anees[len(outcome.time) // 2 :]))
-
-
-def _misjudged(outcome: Outcome) -> float:
-    """Return the absolute logarithm of the mean ANEES of the second half."""
-    return float(abs(np.log(_late_anees(outcome))))
-
-
-def _least(outcomes: Sequence[Outcome], value: Callable[[Outcome], float], said: Callable[[float], str]) -> str:
-    """Return the filters within 5 % of the minimum value."""
-    least = min(value(o) for o in outcomes)
-    return f"{', '.join(o.filter for o in outcomes if value(o) <= 1.05 * least)} ({said(least)})"
+def table(result: Result) -> Table:
+    """Return the outcomes as a table."""
+    columns = {
+        "case": Column("case"),
+        "filter": Column("filter"),
+        "runs": Column("runs"),
+        "converged": Column("converged", shown=lambda share: f"{share:.0%}"),
+        "convergence_time_s": Column("converged after, s", shown=lambda t: "never" if t is None else f"{t:.0f}"),
+        "final_rms_deg": Column("final RMS, °"),
+        "anees_at_10_s": Column("ANEES/6, 10 s", digits=3),
+        "anees_at_end": Column("ANEES/6, end", digits=3),
+        "consistent": Column("consistent"),
+    }
+    rows = [[o.summary()[key] for key in columns] for o in result.outcomes]
+    return Table("Attitude filters from small and large initial errors", list(columns.values()), rows, left=2)
 
 
 def main(
@@ -611,30 +533,19 @@ def main(
     seed: int = 1,
     out: Path | None = None,
 ) -> Result:
-    """Compare the filters; ``duration`` in s. Figure, table, findings and JSON are written to ``out`` if it is given."""
+    """Compare the filters; ``duration`` in s. Figure, table and JSON are written to ``out`` if it is given."""
     outcomes = tuple(
         outcome
         for case in cases
-        for outcome in study(
-            case, filters, runs=runs, unscented_runs=min(runs, unscented_runs), duration=duration, seed=seed
-        )
+        for outcome in study(case, filters, runs=runs, unscented_runs=unscented_runs, duration=duration, seed=seed)
     )
-    if out is None:
-        return Result(outcomes=outcomes, figures=())
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    result = Result(outcomes=outcomes, figures=(draw(outcomes, out / "filter_family.png"),))
-    (out / "filter_family.txt").write_text("\n".join([table(result), "", *findings(result)]) + "\n", encoding="utf-8")
-    write_json(
-        out / "filter_family.json",
-        {
-            "seed": seed,
-            "duration_s": duration,
-            "converged_deg": CONVERGED / DEGREE,
-            "outcomes": [outcome.summary() for outcome in outcomes],
-            "findings": findings(result),
-        },
-    )
+    result = Result(outcomes=outcomes)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        draw(outcomes, out / "filter_family.png")
+        (out / "filter_family.txt").write_text(table(result).text + "\n", encoding="utf-8")
+        content = {"seed": seed, "duration_s": duration, "converged_deg": CONVERGED / DEGREE}
+        write_json(out / "filter_family.json", {**content, "outcomes": [outcome.summary() for outcome in outcomes]})
     return result
 
 
@@ -644,5 +555,4 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--unscented-runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    result = main(**vars(parser.parse_args()))
-    print("\n".join([table(result), "", *findings(result)]))
+    print(table(main(**vars(parser.parse_args()))).text)
