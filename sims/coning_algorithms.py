@@ -23,9 +23,11 @@ import mpmath as mp
 import numpy as np
 
 from strapdown import coning, plots
+from strapdown.checks import Array
 from strapdown.coning import ALGORITHMS, Algorithm
-from strapdown.files import write_json
+from strapdown.files import plain, write_json
 from strapdown.plots import style
+from strapdown.results import Table
 from strapdown.units import DEGREE
 
 DIGITS = 50
@@ -252,67 +254,22 @@ def exact_error(algorithm: str | Algorithm, angle: float, ratio: float, digits: 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Exact errors of every algorithm over a grid of cone angles and frequency ratios, as lists (angle, ratio) by name."""
+    """Exact errors of every algorithm over a grid of cone angles and frequency ratios."""
 
-    angles: tuple[float, ...]
-    """Half-angles of the cone, rad."""
-    ratios: tuple[float, ...]
-    drift: dict[str, list[list[float]]]
-    """Drift in units of ω; zero below the smallest float."""
-    periodic: dict[str, list[list[float]]]
-    """Maximum periodic error, rad."""
+    angles: Array
+    """Half-angles of the cone (a,), rad."""
+    ratios: Array
+    """Frequency ratios λ (r,)."""
+    drift: dict[str, Array]
+    """Magnitude of the drift (a, r) by algorithm, in units of ω; zero below the smallest float."""
+    periodic: dict[str, Array]
+    """Maximum periodic error (a, r), rad."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """Comparison of one of the package's algorithms with the published ones at the points of the grid."""
-
-    own: str
-    points: int
-    drift_lost: tuple[tuple[float, float, str], ...]
-    """(angle in degrees, ratio, published algorithm) where a published drift is lower and the package's is above rounding."""
-    periodic_lost: tuple[tuple[float, float, str], ...]
-    worst_drift_ratio: float
-    """Maximum ratio of its drift to the smallest published one, where its drift is above rounding."""
-    worst_periodic_ratio: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Curves:
-    """Drift against frequency ratio at one cone angle, and against cone angle at one ratio."""
-
-    ratios: tuple[float, ...]
-    small_angle: float
-    large_angle: float
-    drift_at_small_angle: dict[str, list[float]]
-    drift_at_large_angle: dict[str, list[float]]
-    angles: tuple[float, ...]
-    ratio: float
-    drift_by_angle: dict[str, list[float]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """Cost and errors of an algorithm under one coning motion."""
-
-    name: str
-    nanoseconds: float
-    """Time per sample on this machine, ns."""
-    drift: float
-    """Drift in units of ω."""
-    periodic: float
-    """Maximum periodic error, rad."""
-    noise_gain: float
-    """Factor of the increments' white noise in the attitude through the cross terms, per unit of rotation per sample."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ManoeuvreError:
-    """Errors on random manoeuvres: maximum attitude error, rad, by algorithm; one entry per manoeuvre."""
-
-    ratios: tuple[float, ...]
-    """2π × the highest frequency of the manoeuvre × sample interval."""
-    errors: dict[str, list[float]]
+    def against_published(self, own: str, what: str) -> tuple[Array, Array, np.ndarray]:
+        """Return errors of an own algorithm, the smallest published ones, and where the own are rounding (a, r)."""
+        errors = getattr(self, what)
+        rounding = ROUNDING / (ALGORITHMS[own].samples * self.ratios) if what == "drift" else ROUNDING
+        return errors[own], np.min([errors[name] for name in PUBLISHED], axis=0), errors[own] <= rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -320,108 +277,64 @@ class Result:
     """Data of the figures."""
 
     comparison: Comparison
-    verdicts: tuple[Verdict, ...]
-    curves: Curves
-    costs: tuple[Cost, ...]
-    manoeuvres: ManoeuvreError
-
-
-CURVES = (
-    "one-sample",
-    "two-sample",
-    "three-sample",
-    "four-sample",
-    "eight-sample",
-    "one-sample-previous-3",
-    "runge-kutta-4",
-    "magnus-6",
-    "polynomial-4",
-    "polynomial-8",
-    "matched-4-11",
-    "matched-1-8-8",
-)
+    costs: list[dict[str, Any]]
+    """Time, errors under one coning motion, and noise gain of each algorithm."""
+    ratios: list[float]
+    """2π × the highest frequency of each random manoeuvre × sample interval."""
+    manoeuvres: dict[str, list[float]]
+    """Maximum attitude error of each manoeuvre, rad, by algorithm."""
 
 
 def compare(angles: Sequence[float], ratios: Sequence[float]) -> Comparison:
     """Return the exact errors of every published algorithm and of the package's own over the grid."""
-    drift: dict[str, list[list[float]]] = {}
-    periodic: dict[str, list[list[float]]] = {}
-    for name in (*PUBLISHED, *OWN):
-        errors = [[exact_error(name, angle, ratio) for ratio in ratios] for angle in angles]
-        drift[name] = [[float(e.drift) for e in row] for row in errors]
-        periodic[name] = [[float(e.periodic) for e in row] for row in errors]
-    return Comparison(angles=tuple(angles), ratios=tuple(ratios), drift=drift, periodic=periodic)
-
-
-def judge(comparison: Comparison, own: str) -> Verdict:
-    """Return the points where ``own`` is neither better than every published algorithm nor at rounding."""
-    samples = ALGORITHMS[own].samples
-    lost: dict[str, list[tuple[float, float, str]]] = {"drift": [], "periodic": []}
-    worst = {"drift": 0.0, "periodic": 0.0}
-    for i, angle in enumerate(comparison.angles):
-        for j, ratio in enumerate(comparison.ratios):
-            for what, table, rounding in (
-                ("drift", comparison.drift, ROUNDING / (samples * ratio)),
-                ("periodic", comparison.periodic, ROUNDING),
-            ):
-                mine = abs(table[own][i][j])
-                best = min(PUBLISHED, key=lambda name, table=table, i=i, j=j: abs(table[name][i][j]))
-                theirs = abs(table[best][i][j])
-                if mine > rounding:
-                    worst[what] = max(worst[what], mine / theirs if theirs else math.inf)
-                    if mine >= theirs:
-                        lost[what].append((angle / DEGREE, ratio, best))
-    return Verdict(
-        own=own,
-        points=len(comparison.angles) * len(comparison.ratios),
-        drift_lost=tuple(lost["drift"]),
-        periodic_lost=tuple(lost["periodic"]),
-        worst_drift_ratio=worst["drift"],
-        worst_periodic_ratio=worst["periodic"],
+    errors = {
+        name: [[exact_error(name, angle, ratio) for ratio in ratios] for angle in angles] for name in (*PUBLISHED, *OWN)
+    }
+    return Comparison(
+        angles=np.array(angles),
+        ratios=np.array(ratios),
+        drift={name: np.array([[abs(float(e.drift)) for e in row] for row in rows]) for name, rows in errors.items()},
+        periodic={name: np.array([[float(e.periodic) for e in row] for row in rows]) for name, rows in errors.items()},
     )
 
 
-def curves(
-    ratios: Sequence[float], angles: Sequence[float], small_angle: float, large_angle: float, ratio: float
-) -> Curves:
-    """Return the curves of the figures."""
-
-    def drifts(pairs: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
-        return {name: [abs(float(exact_error(name, a, r).drift)) for a, r in pairs] for name in CURVES}
-
-    return Curves(
-        ratios=tuple(ratios),
-        small_angle=small_angle,
-        large_angle=large_angle,
-        drift_at_small_angle=drifts([(small_angle, r) for r in ratios]),
-        drift_at_large_angle=drifts([(large_angle, r) for r in ratios]),
-        angles=tuple(angles),
-        ratio=ratio,
-        drift_by_angle=drifts([(a, ratio) for a in angles]),
-    )
+def lost(comparison: Comparison, own: str, what: str) -> list[str]:
+    """Return the points where an own algorithm is above rounding and not below the smallest published error, with its algorithm."""
+    mine, best, rounding = comparison.against_published(own, what)
+    errors = getattr(comparison, what)
+    return [
+        f"{what}: β = {comparison.angles[i] / DEGREE:g}°, λ = {comparison.ratios[j]:g}: "
+        + min(PUBLISHED, key=lambda name, i=i, j=j: errors[name][i, j])
+        for i, j in np.argwhere((mine >= best) & ~rounding)
+    ]
 
 
-def noise_gain(table: Algorithm) -> float:
-    """Return the root sum of squares of Σ_j K_ij over the window, over √N: noise during a constant rotation of one unit per sample."""
+def worst_ratio(comparison: Comparison, own: str, what: str) -> float:
+    """Return the maximum ratio of an own error to the smallest published one, where it is above rounding."""
+    mine, best, rounding = comparison.against_published(own, what)
+    with np.errstate(divide="ignore"):
+        return float(np.max(np.where(rounding, 0.0, mine / best)))
+
+
+def cost(name: str, angle: float, ratio: float, samples: int) -> dict[str, Any]:
+    """Return the time per sample of an algorithm on this machine, its errors, and its noise gain.
+
+    The noise gain is the factor of the increments' white noise in the attitude through the cross terms, during a constant rotation of one
+    unit per sample: the root sum of squares of Σ_j K_ij over the window, over √N.
+    """
+    table, error = ALGORITHMS[name], exact_error(name, angle, ratio)
     row = [float(sum(products)) for products in table.products]
-    return math.sqrt(math.fsum(x * x for x in row) / table.samples)
+    return {
+        "algorithm": name,
+        "ns": 1e9 * coning.time_per_sample(table, samples),
+        "drift": abs(float(error.drift)),
+        "periodic_rad": float(error.periodic),
+        "noise_gain": math.sqrt(math.fsum(x * x for x in row) / table.samples),
+    }
 
 
-def cost(name: str, angle: float, ratio: float, samples: int) -> Cost:
-    """Return an algorithm's time per sample, minimum of several runs, with its errors."""
-    table = ALGORITHMS[name]
-    error = exact_error(name, angle, ratio)
-    return Cost(
-        name=name,
-        nanoseconds=1e9 * coning.time_per_sample(table, samples),
-        drift=abs(float(error.drift)),
-        periodic=float(error.periodic),
-        noise_gain=noise_gain(table),
-    )
-
-
-def manoeuvres(count: int, seed: int) -> ManoeuvreError:
-    """Return errors on random manoeuvres: sums of harmonics on all axes, sampled at random ratios λ up to 0.8."""
+def manoeuvres(count: int, seed: int) -> tuple[list[float], dict[str, list[float]]]:
+    """Return ratios and errors of random manoeuvres: sums of harmonics on all axes, sampled at random ratios λ up to 0.8."""
     from strapdown.motion import Harmonic, HarmonicRates
     from strapdown.quaternion import conjugate, log, multiply
 
@@ -439,8 +352,7 @@ def manoeuvres(count: int, seed: int) -> ManoeuvreError:
             )
             for f in frequencies
         )
-        h = ratio / (2 * math.pi)
-        edges = np.arange(840 + 1) * h
+        edges = np.arange(840 + 1) * (ratio / (2 * math.pi))
         truth = HarmonicRates(harmonics=harmonics, mean=tuple(generator.uniform(-0.5, 0.5, 3)))
         attitude, increments = truth.attitude(edges), truth.increments(edges)
         ratios.append(ratio)
@@ -448,70 +360,24 @@ def manoeuvres(count: int, seed: int) -> ManoeuvreError:
             n = ALGORITHMS[name].samples
             estimate = coning.integrate(increments, name, attitude[0])
             norms.append(float(np.linalg.norm(log(multiply(conjugate(estimate), attitude[::n])), axis=1).max()))
-    return ManoeuvreError(ratios=tuple(ratios), errors=errors)
+    return ratios, errors
 
 
 # --------------------------------------------------------------------------------------------------------------- the figures
 
 
-def _look(k: int, name: str) -> dict[str, Any]:
-    """Return the style of the line of algorithm k; the package's own are thick."""
-    if name in OWN:
-        return {"color": "k" if name == OWN[-1] else "0.5", "linewidth": 2.2}
-    number = len(style.CYCLE)
-    return {"color": style.CYCLE[k % number], "linewidth": 1.2, "linestyle": ("-", "--")[k // number % 2]}
-
-
-def draw_drift(result: Curves, axes: Any) -> None:
-    """Draw drift against frequency ratio at both cone angles; closed forms are dotted."""
-    shown = np.asarray(result.ratios)
-    for ax, table, angle in zip(
-        axes,
-        (result.drift_at_small_angle, result.drift_at_large_angle),
-        (result.small_angle, result.large_angle),
-        strict=True,
-    ):
-        for k, (name, drift) in enumerate(table.items()):
-            ax.loglog(shown, drift, label=name, **_look(k, name))
-            a = ALGORITHMS[name]
-            leading = abs(float(a.drift_constant)) * angle**2 * shown**a.drift_order
-            ax.loglog(shown, leading, color="0.6", lw=0.6, ls=":")
-        ax.axhspan(1e-60, ROUNDING, color="0.9")
-        ax.set(xlabel="frequency ratio λ = ωh", title=f"β = {angle / DEGREE:.3g}°", ylim=(1e-34, 1e-1))
-    axes[0].set_ylabel("drift / ω   (dotted: closed form; grey: below rounding)")
-    axes[1].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-
-def draw_floor(result: Curves, ax: Any) -> None:
-    """Draw drift against cone angle: second-order forms deviate from β² towards a floor that grows as β⁴."""
-    angles = np.asarray(result.angles) / DEGREE
-    for k, (name, drift) in enumerate(result.drift_by_angle.items()):
-        ax.loglog(angles, drift, label=name, **_look(k, name))
-    ax.axhspan(1e-60, ROUNDING, color="0.9")
-    ax.set(xlabel="cone half-angle β, °", ylabel="drift / ω", title=f"λ = {result.ratio:g}", ylim=(1e-30, 1e-2))
-    ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-
-def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
+def draw_costs(costs: Sequence[dict[str, Any]], ax: Any) -> None:
     """Draw drift against time per sample, with the Pareto front."""
-    front = [c for c in costs if not any(o.nanoseconds < c.nanoseconds and o.drift < c.drift for o in costs)]
-    ax.loglog([c.nanoseconds for c in costs], [c.drift for c in costs], "o", color="0.7", ms=4, label="others")
-    front.sort(key=lambda c: c.nanoseconds)
-    ax.loglog(
-        [c.nanoseconds for c in front],
-        [c.drift for c in front],
-        "o-",
-        color=style.BLUE,
-        ms=5,
-        label="none is both faster and more accurate",
-    )
-    labelled: list[Cost] = []
+    front = [c for c in costs if not any(o["ns"] < c["ns"] and o["drift"] < c["drift"] for o in costs)]
+    front.sort(key=lambda c: c["ns"])
+    points = lambda rows: ([c["ns"] for c in rows], [c["drift"] for c in rows])  # noqa: E731
+    ax.loglog(*points(costs), "o", color="0.7", ms=4, label="others")
+    ax.loglog(*points(front), "o-", color=style.BLUE, ms=5, label="none is both faster and more accurate")
+    last = 1e99
     for c in front:  # labels that would overlap are omitted
-        if all(abs(math.log10(c.drift / o.drift)) > 0.7 for o in labelled):
-            ax.annotate(
-                c.name, (c.nanoseconds, c.drift), fontsize=7, xytext=(-6, -3), textcoords="offset points", ha="right"
-            )
-            labelled.append(c)
+        if abs(math.log10(c["drift"] / last)) > 0.7:
+            last, place = c["drift"], (c["ns"], c["drift"])
+            ax.annotate(c["algorithm"], place, fontsize=7, xytext=(-6, -3), textcoords="offset points", ha="right")
     ax.set_xlim(left=1.0)
     ax.set(xlabel="time per sample, ns", ylabel="drift / ω", title="cost against error")
     ax.legend(fontsize=8, loc="lower left")
@@ -519,108 +385,85 @@ def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
 
 def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
     """Draw the ratio of own error to the smallest published one over the grid: below zero own is better. Dot: rounding; cross: worse."""
-    angles, ratios = np.asarray(comparison.angles) / DEGREE, np.asarray(comparison.ratios)
-    for ax, table, what in zip(axes, (comparison.drift, comparison.periodic), ("drift", "periodic error"), strict=True):
-        mine = np.abs(np.array(table[own]))
-        best = np.min([np.abs(np.array(table[name])) for name in PUBLISHED], axis=0)
-        rounding = ROUNDING / (ALGORITHMS[own].samples * ratios) if what == "drift" else np.full(len(ratios), ROUNDING)
+    for ax, what, words in zip(axes, ("drift", "periodic"), ("drift", "periodic error"), strict=True):
+        mine, best, rounding = comparison.against_published(own, what)
         ratio = np.log10(np.maximum(mine, 1e-300) / np.maximum(best, 1e-300))
         ax.grid(visible=False)
         image = ax.imshow(ratio, cmap="RdBu_r", vmin=-6, vmax=6, origin="lower", aspect="auto")
-        for i, j in np.argwhere(mine < rounding):
+        for i, j in np.argwhere(rounding):
             ax.text(j, i, "·", ha="center", va="center", fontsize=16, color="0.65")
-        for i, j in np.argwhere((mine >= best) & (mine >= rounding)):
+        for i, j in np.argwhere((mine >= best) & ~rounding):
             ax.text(j, i, "×", ha="center", va="center", fontsize=9)
-        ax.set_xticks(range(len(ratios)), [f"{r:g}" for r in ratios], fontsize=7)
-        ax.set_yticks(range(len(angles)), [f"{a:g}" for a in angles], fontsize=7)
-        ax.set(xlabel="frequency ratio λ", ylabel="cone half-angle β, °", title=f"{own}: {what} (dots: rounding)")
+        ax.set_xticks(range(len(comparison.ratios)), [f"{r:g}" for r in comparison.ratios], fontsize=7)
+        ax.set_yticks(range(len(comparison.angles)), [f"{a / DEGREE:g}" for a in comparison.angles], fontsize=7)
+        ax.set(xlabel="frequency ratio λ", ylabel="cone half-angle β, °", title=f"{own}: {words} (dots: rounding)")
         ax.figure.colorbar(image, ax=ax, label="log₁₀ (own / smallest published)")
 
 
-def draw_manoeuvres(result: ManoeuvreError, ax: Any) -> None:
+def draw_manoeuvres(result: Result, ax: Any) -> None:
     """Draw the errors on random manoeuvres against their frequency ratio: published in grey, their best and the package's in colour."""
-    ratios = np.asarray(result.ratios)
-    published = np.array([result.errors[name] for name in PUBLISHED])
+    published = np.array([result.manoeuvres[name] for name in PUBLISHED])
     for k, errors in enumerate(published):
-        ax.loglog(ratios, errors, ".", color="0.75", ms=3, label=None if k else "each published")
-    ax.loglog(ratios, published.min(axis=0), "v", color=style.ORANGE, ms=5, label="smallest published")
-    for k, name in enumerate(OWN):
-        ax.loglog(ratios, result.errors[name], "o", color=style.CYCLE[k] if k < 3 else "k", ms=3, label=name)
-    ax.set(
-        xlabel="frequency ratio λ of the highest frequency",
-        ylabel="maximum attitude error, rad",
-        title="random manoeuvres, 840 samples",
-    )
+        ax.loglog(result.ratios, errors, ".", color="0.75", ms=3, label=None if k else "each published")
+    ax.loglog(result.ratios, published.min(axis=0), "v", color=style.ORANGE, ms=5, label="smallest published")
+    for name, color in zip(OWN, (*style.CYCLE[:3], "k"), strict=True):
+        ax.loglog(result.ratios, result.manoeuvres[name], "o", color=color, ms=3, label=name)
+    ax.set(xlabel="frequency ratio λ of the highest frequency", ylabel="maximum attitude error, rad")
+    ax.set_title("random manoeuvres, 840 samples")
     ax.legend(fontsize=8)
 
 
-def draw(result: Result, folder: Path) -> list[Path]:
-    """Write the figures into ``folder``; return their paths."""
-    drift, axes = plots.new_figure(1, 2, size=(10.5, 5.0), sharey=True)
-    draw_drift(result.curves, axes)
-    floor, ax = plots.new_figure(size=(8.0, 5.0))
-    draw_floor(result.curves, ax)
+def draw(result: Result, folder: Path) -> None:
+    """Write the figures into ``folder``."""
     cost, ax = plots.new_figure(size=(8.0, 5.0))
     draw_costs(result.costs, ax)
     comparison, axes = plots.new_figure(2, 2, size=(10.5, 8.0))
     for row, own in zip(axes, ("matched-4-11", "matched-1-8-8"), strict=True):
         draw_comparison(result.comparison, own, row)
     manoeuvres, ax = plots.new_figure(size=(8.0, 5.0))
-    draw_manoeuvres(result.manoeuvres, ax)
-    figures = {"drift": drift, "floor": floor, "cost": cost, "comparison": comparison, "manoeuvres": manoeuvres}
-    return [plots.save(figure, folder / f"coning-{name}.png") for name, figure in figures.items()]
+    draw_manoeuvres(result, ax)
+    for name, figure in (("cost", cost), ("comparison", comparison), ("manoeuvres", manoeuvres)):
+        plots.save(figure, folder / f"coning-{name}.png")
 
 
 def main(*, out: str | Path | None = None, quick: bool = False, seed: int = 1) -> Result:
     """Run the study; with ``out``, write the figures and ``coning.json`` into that folder."""
     degrees = (1.0, 20.0) if quick else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0, 30.0, 45.0)
     ratios = (0.1, 0.5) if quick else (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
-    comparison = compare([d * DEGREE for d in degrees], ratios)
+    names = list(ALGORITHMS)
+    flown, errors = manoeuvres(3 if quick else 60, seed)
     result = Result(
-        comparison=comparison,
-        verdicts=tuple(judge(comparison, own) for own in OWN),
-        curves=curves(
-            np.geomspace(0.02, 1.0, 2 if quick else 25).tolist(),
-            (np.geomspace(0.01, 45.0, 2 if quick else 25) * DEGREE).tolist(),
-            0.1 * DEGREE,
-            20.0 * DEGREE,
-            0.2,
-        ),
-        costs=tuple(cost(name, 5.0 * DEGREE, 0.3, 840 if quick else 20160) for name in ALGORITHMS),
-        manoeuvres=manoeuvres(3 if quick else 60, seed),
+        comparison=compare([d * DEGREE for d in degrees], ratios),
+        costs=[cost(name, 5.0 * DEGREE, 0.3, 840 if quick else 20160) for name in names],
+        ratios=flown,
+        manoeuvres=errors,
     )
     if out is not None:
         folder = Path(out)
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "coning.json", asdict(result))
+        write_json(folder / "coning.json", plain(asdict(result)))
         draw(result, folder)
     return result
 
 
 def table(result: Result) -> str:
-    """Return the verdicts as text."""
+    """Return costs and errors of each algorithm, and a summary of the package's own, as text."""
     lines = []
-    for v in result.verdicts:
-        lines.append(
-            f"{v.own:15s} {v.points} points: drift worse at {len(v.drift_lost)} (maximum own/published {v.worst_drift_ratio:.2g}), "
-            f"periodic error worse at {len(v.periodic_lost)} (maximum {v.worst_periodic_ratio:.2g})"
-        )
-        for what, places in (("drift", v.drift_lost), ("periodic", v.periodic_lost)):
-            lines += [f"    {what}: β = {b:g}°, λ = {r:g}: {name}" for b, r, name in places]
-    lines.append("")
-    for c in sorted(result.costs, key=lambda c: c.drift):
-        lines.append(
-            f"{c.name:25s} {c.nanoseconds:8.1f} ns  drift {c.drift:9.2e}  periodic {c.periodic:9.2e}  noise {c.noise_gain:6.2f}"
-        )
-    m = result.manoeuvres
-    best = np.min([m.errors[name] for name in PUBLISHED], axis=0)
     for own in OWN:
-        mine = np.asarray(m.errors[own])
+        best = np.min([result.manoeuvres[name] for name in PUBLISHED], axis=0)
+        mine = np.asarray(result.manoeuvres[own])
         won = np.sum((mine < best) | (mine < MANOEUVRE_ROUNDING))
-        lines.append(
-            f"random manoeuvres: {own} below every published, or below {MANOEUVRE_ROUNDING:g} rad, in {won} of {len(mine)}"
+        worse = {what: lost(result.comparison, own, what) for what in ("drift", "periodic")}
+        counts = ", ".join(
+            f"{what} worse at {len(places)} (maximum own/published {worst_ratio(result.comparison, own, what):.2g})"
+            for what, places in worse.items()
         )
-    return "\n".join(lines)
+        lines.append(f"{own}, {result.comparison.drift[own].size} points: {counts}")
+        lines.append(f"  best, or below {MANOEUVRE_ROUNDING:g} rad, in {won} of {len(mine)} random manoeuvres")
+        lines += [f"    {place}" for places in worse.values() for place in places]
+    columns = ("algorithm", "time, ns", "drift / ω", "periodic, rad", "noise gain")
+    rows = [tuple(c.values()) for c in sorted(result.costs, key=lambda c: c["drift"])]
+    return Table("Integration algorithms under coning of 5°, λ = 0.3", columns, rows, lines).text
 
 
 if __name__ == "__main__":
@@ -628,5 +471,4 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("results/coning_algorithms"))
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    print(table(main(out=arguments.out, quick=arguments.quick, seed=arguments.seed)))
+    print(table(main(**vars(parser.parse_args()))))
