@@ -28,6 +28,7 @@ from strapdown.estimation import multiple_model
 from strapdown.estimation.states import ProcessNoise
 from strapdown.plots import style
 from strapdown.randomness import generator
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 CONVERGED = 1.0 * DEGREE
@@ -42,13 +43,6 @@ FILTERS = ("bank of 24", "bank of 48", "bank of 96", "mekf")
 SMALL = {"runs": 3, "duration": 900.0}
 """Arguments of a quick test run."""
 
-COLOURS = {
-    "bank of 24": style.SKY,
-    "bank of 48": style.GREEN,
-    "bank of 96": style.BLUE,
-    "mekf": style.VERMILION,
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -61,13 +55,6 @@ class Outcome:
     """Attitude error of each run (runs, m), rad."""
     nees: Array
     """NEES of all six states of each run (runs, m), per degree of freedom."""
-    became_one: Array
-    """Time at which one hypothesis is left in each run (runs,), s; 0 for a single filter."""
-
-    @property
-    def runs(self) -> int:
-        """Number of independent runs."""
-        return len(self.error)
 
     @property
     def convergence(self) -> Array:
@@ -80,27 +67,12 @@ class Outcome:
         """Mean NEES over the runs (m,), 1 for a consistent filter."""
         return np.asarray(self.nees.mean(axis=0))
 
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of the ANEES at one epoch."""
-        return consistency.mean_bounds(6, self.runs)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
     """Results of the study."""
 
     outcomes: tuple[Outcome, ...]
-    figures: tuple[Path, ...]
-
-    def outcome(self, name: str) -> Outcome:
-        """Return the outcome of one filter."""
-        return next(o for o in self.outcomes if o.filter == name)
-
-
-def anywhere(random: np.random.Generator) -> Array:
-    """Return an attitude (4,), uniform over all attitudes."""
-    return quaternion.normalize(random.standard_normal(4))
 
 
 def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
@@ -108,57 +80,39 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=duration)
     gyro = scenario.gyro
     noise = ProcessNoise(angle_random_walk=float(gyro.angle_random_walk), rate_random_walk=float(gyro.rate_random_walk))
-    errors, nees, became_one = [], [], []
-    first = 0
+    errors, nees = [], []
     for run in range(runs):
-        # The motion's initial attitude is random, so that the identity is a random initial estimate.
-        random = generator(seed, run, "start")
-        turned = dataclasses.replace(scenario.motion, initial_attitude=anywhere(random))  # type: ignore[type-var]
+        # The motion's initial attitude is uniform over all attitudes, so that the identity is a random initial estimate.
+        anywhere = quaternion.normalize(generator(seed, run, "start").standard_normal(4))
+        turned = dataclasses.replace(scenario.motion, initial_attitude=anywhere)  # type: ignore[type-var]
         record = scenarios.simulate(dataclasses.replace(scenario, motion=turned), seed, run)
-        assert record.truth is not None
         if name.startswith("bank"):
-            bank = multiple_model.run(
-                record, noise, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
-            )
-            estimate, rows = bank.estimate, np.searchsorted(record.time, bank.estimate.time)
-            became_one.append(bank.became_one)
+            number = int(name.rpartition(" ")[2])
+            bank = multiple_model.run(record, noise, hypotheses=number, bias_sigma=BIAS_SIGMA, every=EVERY)
+            estimate = bank.estimate
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
             estimate = estimation.run(record, noise, initial, every=EVERY, full_covariance=True)
-            rows = np.arange(0, len(record.time), EVERY)
-            became_one.append(0.0)
-        truth = record.truth
-        e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[rows], truth.bias[rows])
-        errors.append(quaternion.angle_between(truth.attitude[rows], estimate.attitude))
+        assert record.truth is not None
+        truth = record.truth.taken(np.searchsorted(record.time, estimate.time))
+        e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
+        errors.append(quaternion.angle_between(truth.attitude, estimate.attitude))
         nees.append(consistency.nees(e, estimate.covariance) / 6.0)
-        first = rows[0]
-    return Outcome(
-        filter=name,
-        time=record.time[first::EVERY],
-        error=np.array(errors),
-        nees=np.array(nees),
-        became_one=np.array(became_one),
-    )
+    return Outcome(filter=name, time=estimate.time, error=np.array(errors), nees=np.array(nees))
 
 
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     """Draw error and ANEES over time and write the figure."""
     figure, (left, middle, right) = plots.new_figure(1, 3, size=(10.5, 4.6))
-    for o in outcomes:
+    for o, color in zip(outcomes, (style.SKY, style.GREEN, style.BLUE, style.VERMILION), strict=False):
         hours = o.time / 3600.0
-        line: dict[str, Any] = {"color": COLOURS.get(o.filter, style.ORANGE), "linewidth": 1.5}
-        left.plot(
-            hours,
-            np.quantile(o.error, 0.5, axis=0) / DEGREE,
-            label=f"{o.filter}, {o.runs} {'run' if o.runs == 1 else 'runs'}",
-            **line,
-        )
-        left.plot(hours, np.quantile(o.error, 0.95, axis=0) / DEGREE, linestyle=(0, (3, 2)), **line)
-        middle.plot(hours, o.anees, **line)
-        if o.filter.startswith("bank"):
-            right.plot(hours, o.anees, **line)
-    most = max(outcomes, key=lambda o: o.runs)
-    right.axhspan(*most.bounds, color="0.85", zorder=0)
+        line: dict[str, Any] = {"color": color, "linewidth": 1.5}
+        median, most = np.quantile(o.error, [0.5, 0.95], axis=0) / DEGREE
+        left.plot(hours, median, label=f"{o.filter}, {len(o.error)} runs", **line)
+        left.plot(hours, most, linestyle=(0, (3, 2)), **line)
+        for ax in (middle, right) if o.filter.startswith("bank") else (middle,):
+            ax.plot(hours, o.anees, **line)
+    right.axhspan(*consistency.mean_bounds(6, len(outcomes[0].error)), color="0.85", zorder=0)
     left.axhline(CONVERGED / DEGREE, color="0.6", linewidth=0.8, linestyle=":")
     left.set(yscale="log", xlabel="time, h", ylabel="attitude error, °")
     left.set_title("Median; dashes: 95th percentile")
@@ -166,27 +120,24 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     middle.set_title("Consistent: 1 (log scale)")
     right.set(xlabel="time, h", ylabel="ANEES / 6")
     right.set_title("The banks, with 99 % bounds")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    style.legend_below(figure, [left], ncols=5)
     return plots.save(figure, path)
 
 
-def table(result: Result) -> str:
-    """Return the figures as text."""
-    lines = [
-        f"{'filter':16s} {'runs':>5s} {'converged':>9s} {'to 1°, h: median':>16s} {'95 %':>7s} {'worst':>7s} "
-        f"{'ANEES/6: 0.1 h':>14s} {'0.25 h':>9s} {'1 h':>9s} {'end':>9s}  99 % bounds"
-    ]
+def table(result: Result) -> Table:
+    """Return the outcomes as a table."""
+    hour = lambda t: f"{t:.3f}" if np.isfinite(t) else "never"  # noqa: E731
+    times = [Column(f"to 1°: {words}, h", shown=hour) for words in ("median", "95 %", "worst")]
+    anees = [Column(f"ANEES/6, {words}", digits=3) for words in ("0.1 h", "0.25 h", "1 h", "end")]
+    rows = []
     for o in result.outcomes:
         hours = np.sort(o.convergence) / 3600.0
-        anees = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
-        low, high = o.bounds
-        quantiles = [hours[min(int(np.ceil(p * o.runs)) - 1, o.runs - 1)] for p in (0.5, 0.95, 1.0)]
-        within = [f"{time:.3f}" if np.isfinite(time) else "never" for time in quantiles]
-        lines.append(
-            f"{o.filter:16s} {o.runs:5d} {100.0 * np.mean(np.isfinite(hours)):7.0f} % {within[0]:>16s} {within[1]:>7s} "
-            f"{within[2]:>7s} {anees[0]:14.3g} {anees[1]:9.3g} {anees[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
-        )
-    return "\n".join(lines)
+        quantiles = [hours[int(np.ceil(p * len(hours))) - 1] for p in (0.5, 0.95, 1.0)]
+        epochs = np.minimum(np.searchsorted(o.time, [360.0, 900.0, 3600.0, np.inf]), len(o.time) - 1)
+        rows.append((o.filter, len(hours), f"{np.mean(np.isfinite(hours)):.0%}", *quantiles, *o.anees[epochs]))
+    low, high = consistency.mean_bounds(6, len(result.outcomes[0].error))
+    note = f"99 % bounds of ANEES/6: {low:.3f} to {high:.3f}."
+    return Table("Attitude from a magnetometer alone", ["filter", "runs", "converged", *times, *anees], rows, [note])
 
 
 def main(
@@ -198,13 +149,12 @@ def main(
     out: str | os.PathLike[str] | None = None,
 ) -> Result:
     """Compare the filters; ``duration`` in s. The figure and the table are written to ``out`` if it is given."""
-    outcomes = tuple(study(name, runs=runs, duration=duration, seed=seed) for name in filters)
-    if out is None:
-        return Result(outcomes=outcomes, figures=())
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    result = Result(outcomes=outcomes, figures=(draw(outcomes, folder / "unknown_start.png"),))
-    (folder / "unknown_start.txt").write_text(table(result) + "\n", encoding="utf-8")
+    result = Result(outcomes=tuple(study(name, runs=runs, duration=duration, seed=seed) for name in filters))
+    if out is not None:
+        folder = Path(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        draw(result.outcomes, folder / "unknown_start.png")
+        (folder / "unknown_start.txt").write_text(table(result).text + "\n", encoding="utf-8")
     return result
 
 
@@ -214,4 +164,4 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--duration", type=float, default=10800.0, help="s")
     parser.add_argument("--seed", type=int, default=1)
-    print(table(main(**vars(parser.parse_args()))))
+    print(table(main(**vars(parser.parse_args()))).text)
