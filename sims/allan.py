@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from strapdown import allan, gyro, plots, units
 from strapdown.checks import Array
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.results import Column, Table
 
 TRUTH = GyroSpec(
     quantization=0.3 * units.ARCSECOND,
@@ -49,7 +49,6 @@ class Result:
     truth: dict[str, float]
     deviation: allan.AllanDeviation
     fit: allan.NoiseFit
-    figures: tuple[Path, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,17 +82,14 @@ def rest_increments(spec: GyroSpec, samples: int, sample_interval: float, seed: 
     return gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(seed, run, "gyro")).increments
 
 
-def main(
-    *, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1, out: str | Path | None = None
-) -> Result:
+def main(*, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1, out: Path | None = None) -> Result:
     """Simulate a gyro at rest and identify it; figures are written to ``out`` if it is given."""
     increments = rest_increments(TRUTH, samples, sample_interval, seed)
     deviation = allan.allan_deviation(increments, sample_interval, kind="increments")
     fit = allan.fit_noise(increments, sample_interval, kind="increments")
-    figures = []
     if out is not None:
-        figures.append(plots.save(plots.allan_overview(deviation, fit), Path(out) / "allan.png"))
-    return Result(truth=coefficients(TRUTH), deviation=deviation, fit=fit, figures=tuple(figures))
+        plots.save(plots.allan_overview(deviation, fit), out / "allan.png")
+    return Result(truth=coefficients(TRUTH), deviation=deviation, fit=fit)
 
 
 def study(spec: GyroSpec, *, samples: int, runs: int, sample_interval: float = 0.01, seed: int = 1) -> Study:
@@ -124,26 +120,22 @@ def case(name: str, runs: int) -> Study:
     return study(dataclasses.replace(TRUTH, **changes), samples=samples, runs=runs)
 
 
-def lines(name: str, result: Study) -> list[str]:
-    """Return the study as a table."""
-    rows = [f"{name}: {len(result.covered)} axes"]
-    for i, term in enumerate(allan.TERMS):
-        if result.truth[term] > 0.0:
-            rows.append(
-                f"  {term:20s} covered {100 * result.covered[:, i].mean():5.1f} %   seen {100 * result.supported[:, i].mean():5.1f} %   "
-                f"rms error {100 * result.relative_rms(term):5.1f} %, expected {100 * result.expected[term] / result.truth[term]:5.1f} %"
-            )
-    return rows
-
-
-def print_fit(fit: allan.NoiseFit, truth: Mapping[str, float]) -> None:
-    """Print the intervals beside the truth."""
-    for row in fit.listing().records:
-        interval = (
-            f"{row['lower']:.4g} to {row['upper']:.4g}" if row["supported"] else f"not seen, below {row['upper']:.4g}"
+def table(name: str, result: Study) -> Table:
+    """Return the coverage of the intervals and the errors of the coefficients."""
+    percent = lambda share: f"{100.0 * share:.1f} %"  # noqa: E731
+    columns = [Column(words, shown=percent) for words in ("covered", "detected", "RMS error", "expected")]
+    rows = [
+        (
+            term,
+            result.covered[:, i].mean(),
+            result.supported[:, i].mean(),
+            result.relative_rms(term),
+            result.expected[term] / result.truth[term],
         )
-        size = truth[row["term"]] / allan.UNITS["gyro"][row["term"]].factor
-        print(f"{row['axis']} {row['term']:20s} {interval:28s} {row['unit']:10s} truth {size:.4g}")
+        for i, term in enumerate(allan.TERMS)
+        if result.truth[term] > 0.0
+    ]
+    return Table(f"{name}: {len(result.covered)} axes", ["term", *columns], rows)
 
 
 if __name__ == "__main__":
@@ -153,9 +145,11 @@ if __name__ == "__main__":
     parser.add_argument("--study", action="store_true", help="count how often the intervals contain the truth")
     arguments = parser.parse_args()
     if arguments.study:
-        for each in CASES:
-            print(*lines(each, case(each, 134)), sep="\n", flush=True)
+        for name in CASES:
+            print(table(name, case(name, 134)).text, flush=True)
     else:
         result = main(seed=arguments.seed, out=arguments.out)
-        print_fit(result.fit, result.truth)
-        print("figures:", *result.figures)
+        print(result.fit.listing().text)
+        units_of = allan.UNITS["gyro"]
+        truth = (f"{term} {value / units_of[term][1]:.4g} {units_of[term][0]}" for term, value in result.truth.items())
+        print(f"Truth: {', '.join(truth)}.")
