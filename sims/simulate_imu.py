@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import periodogram
 
 from strapdown import gyro, plots, units
 from strapdown.gyro import datasheets
@@ -59,7 +60,7 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
     for name, fields in {**{part: (field,) for part, field in PARTS.items()}, "whole": tuple(PARTS.values())}.items():
         spec = gyro.GyroSpec(**{field: getattr(whole, field) for field in fields})
         outputs[name] = gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(seed, 0, "gyro"))
-    frequency, counts, spectra = None, None, {}
+    spectra = {}
     for name, output in outputs.items():
         frequency, counts, spectra[name] = spectrum(output.rates, rate)
     lines = np.fft.rfftfreq(samples, 1.0 / rate)[1:]
@@ -84,10 +85,7 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
         bias=outputs["whole"].bias[thin],
     )
     if out is not None:
-        page, axes = plots.new_figure(1, 2, size=(11.0, 4.5))
-        draw_spectra(result, ax=axes[0])
-        draw_bias(result, ax=axes[1])
-        plots.save(page, Path(out) / "simulate_imu.png")
+        draw(result, Path(out) / "simulate_imu.png")
     return result
 
 
@@ -96,11 +94,9 @@ def spectrum(rates, rate):
 
     The half sine leaks as f⁻⁴, as needed for a spectrum of f⁻²; of three neighbouring lines two count as independent.
     """
-    n = len(rates)
-    window = np.sin(np.pi * (np.arange(n) + 0.5) / n)[:, None]
-    power = np.mean(np.abs(np.fft.rfft(rates * window, axis=0)) ** 2, axis=1) / (np.sum(window**2) * rate)
-    middle, counts, values = in_bands(power)
-    return middle * rate / n, 2.0 * counts, values
+    _, power = periodogram(rates, rate, window="cosine", detrend=False, axis=0)
+    middle, counts, values = in_bands(0.5 * power.mean(axis=1))  # two-sided
+    return middle * rate / len(rates), 2.0 * counts, values
 
 
 def in_bands(lines):
@@ -111,36 +107,25 @@ def in_bands(lines):
     return np.sqrt(edges[:-1] * np.maximum(edges[1:] - 1.0, edges[:-1])), counts, values
 
 
-def draw_spectra(result, *, ax):
-    """Draw the spectra with the theoretical ones; return the axes."""
+def draw(result, path):
+    """Draw the spectra with the theoretical ones, and the drifting bias of the three axes, and write the figure."""
+    figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.5))
     scale = units.DEGREE_PER_HOUR**2
-    for number, (name, values) in enumerate(result.spectra.items()):
+    for colour, (name, values) in zip(style.CYCLE, result.spectra.items(), strict=False):
         rings = {"ms": 6, "mfc": "none"} if name == "whole" else {"ms": 3}  # around the points of the dominant term
-        colour = style.CYCLE[number]
-        ax.loglog(result.frequency, values / scale, "o", color=colour, label=f"{name}, simulated", **rings)
-        ax.loglog(result.frequency, result.theory[name] / scale, "-", color=colour, lw=1.0)
-    ax.set_xlabel("frequency, Hz")
-    ax.set_ylabel("two-sided PSD, (°/h)²/Hz")
-    ax.set_title(f"{result.preset} at rest (lines: theory)")
-    ax.legend(frameon=False)
-    return ax
-
-
-def draw_bias(result, *, ax):
-    """Draw the drifting bias of the three axes, each in a separate band; return the axes."""
+        left.loglog(result.frequency, values / scale, "o", color=colour, label=f"{name}, simulated", **rings)
+        left.loglog(result.frequency, result.theory[name] / scale, "-", color=colour, lw=1.0)
+    left.set(
+        xlabel="frequency, Hz", ylabel="two-sided PSD, (°/h)²/Hz", title=f"{result.preset} at rest (lines: theory)"
+    )
+    left.legend(frameon=False)
     bias = result.bias / units.DEGREE_PER_HOUR
-    band = 2.2 * np.abs(bias).max()
-    for number, (axis, values) in enumerate(zip("xyz", bias.T, strict=True)):
-        ax.axhline(-number * band, color="0.5", lw=0.6)
-        ax.plot(result.time, values - number * band, color=style.CYCLE[number], lw=0.7, label=axis)
-    ax.set_xlabel("time, s")
-    step = float(f"{0.5 * np.abs(bias).max():.0e}")
-    marks = [(k * step - number * band, f"{k * step:g}") for number in range(3) for k in (-1, 0, 1)]
-    ax.set_yticks(*zip(*marks, strict=True))  # each axis about its own zero
-    ax.set_ylabel("bias minus turn-on bias, °/h")
-    ax.set_ylim(-2.6 * band, 0.6 * band)
-    style.legend_above(ax)
-    return ax
+    apart = np.ceil(2.0 * np.abs(bias).max())
+    for number, axis in enumerate("xyz"):
+        right.plot(result.time, bias[:, number] - number * apart, lw=0.7, label=axis)
+    right.set(xlabel="time, s", ylabel=f"bias minus turn-on bias, axes {apart:g} °/h apart, °/h")
+    style.legend_above(right)
+    return plots.save(figure, path)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import gyro, motion, scenarios, tuning, units, vectors
+from strapdown import gyro, motion, plots, scenarios, tuning, units, vectors
 from strapdown.estimation import setup
+from strapdown.plots import style
+from strapdown.plots import tuning as drawing
 from strapdown.tuning import Comparison, Tuning
 
 FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
@@ -83,70 +85,32 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
 
 
 def draw(result, folder):
-    """Write the figures: searches, slices, values against the truth."""
-    from strapdown import plots
-    from strapdown.plots import tuning as drawing
-
+    """Write the figures: values against the truth, slices of the likelihood."""
+    figure, ax = plots.new_figure(size=(6.5, 4.6))
+    values(result, ax)
     tuned = result.too_small
-    shown = [parameter.unit for parameter in tuned.parameters]
-    figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
-    for number, search in enumerate((result.too_large, result.too_small)):
-        searches(search, shown, left, label=number == 0)
-    left.set_title(f"{2 * len(result.too_large.starts)} searches", loc="left")
-    values(result, right)
-    plots.save(figure, folder / "tune_filter.png")
-    plots.save(
-        drawing.likelihood_slices(tuning.slices(tuned), tuned),
-        folder / "tune_filter-likelihood.png",
-    )
-
-
-def searches(tuned, shown, ax, *, label):
-    """Draw the start and the end of each search in the plane of the two parameters."""
-    from strapdown.plots import style
-
-    begin, end = (
-        [np.exp(points[:, j]) / unit.factor for j, unit in enumerate(shown[:2])]
-        for points in (tuned.starts, tuned.optima)
-    )
-    for k in range(len(tuned.starts)):
-        ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=style.CYCLE[0], linewidth=0.5, alpha=0.5)
-    ax.plot(*begin, "o", color=style.VERMILION, markersize=3.5, label="start of a search" if label else None)
-    ax.plot(*end, "o", color=style.BLUE, markersize=6, label="end of a search" if label else None)
-    names = [f"{parameter.name}, {unit.name}" for parameter, unit in zip(tuned.parameters, shown, strict=False)]
-    ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
-    style.legend_above(ax, ncols=2)
+    figures = {
+        "tune_filter": figure,
+        "tune_filter-likelihood": drawing.likelihood_slices(tuning.slices(tuned), tuned),
+    }
+    for name, figure in figures.items():
+        plots.save(figure, folder / f"{name}.png")
 
 
 def values(result, ax):
     """Draw tuned values relative to the truth with their intervals, and the spread of the Cramér–Rao bound."""
-    from strapdown.plots.style import legend_above
-
-    place = np.arange(len(FREE))
+    place, truth = np.arange(len(FREE)), np.array(list(result.truth.values()))
     for shift, search, name in ((-0.12, result.too_large, "from 30 times"), (0.12, result.too_small, "from a 30th")):
-        ratio = np.array([[p.value, p.lower, p.upper] for p in search.parameters]).T / np.array(
-            list(result.truth.values())
-        )
-        ax.errorbar(
-            place + shift, ratio[0], (ratio[0] - ratio[1], ratio[2] - ratio[0]), fmt="o", ms=4, capsize=3, label=name
-        )
+        value, lower, upper = np.array([[p.value, p.lower, p.upper] for p in search.parameters]).T / truth
+        ax.errorbar(place + shift, value, (value - lower, upper - value), fmt="o", ms=4, capsize=3, label=name)
     half = 1.96 * np.array([parameter.standard_error for parameter in result.too_small.parameters])
-    ax.bar(
-        place,
-        np.exp(half) - np.exp(-half),
-        bottom=np.exp(-half),
-        width=0.6,
-        alpha=0.2,
-        label="95 % of the Cramér–Rao bound",
-    )
+    bound = {"height": np.exp(half) - np.exp(-half), "bottom": np.exp(-half), "width": 0.6, "alpha": 0.2}
+    ax.bar(place, **bound, label="95 % of the Cramér–Rao bound")
     ax.axhline(1.0, lw=0.8, color="k")
     ax.set_xticks(place, FREE)
     ax.set_ylabel("tuned value over the true one")
-    ax.set_yscale("log")
-    ticks = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5)
-    ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-    ax.set_yticks([], minor=True)
-    legend_above(ax, ncols=2)
+    style.log_scale(ax)
+    style.legend_below(ax.figure, [ax])
 
 
 if __name__ == "__main__":
