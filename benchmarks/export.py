@@ -20,7 +20,6 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,8 +31,10 @@ import strapdown as sd
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
 from strapdown.recordings import Recording
+from strapdown.results import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import timing
 from sims import export_filter
 
 ARM = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-Os", "-ffunction-sections")
@@ -310,16 +311,6 @@ def on_this_machine(filter_: Filter, rows: np.ndarray, folder: Path, *, single: 
     return float(subprocess.run([folder / "run"], check=True, capture_output=True, text=True).stdout)
 
 
-def seconds(kernel: Callable[[], Any], repeats: int) -> float:
-    """Return the least time of a call, after a first one."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.process_time()
-        kernel()
-        times.append(time.process_time() - start)
-    return min(times[1:])
-
-
 def main(*, duration: float = 100.0, repeats: int = 5, sources: Path | None = None) -> dict[str, Any]:
     """Return what is missing, and the columns of each filter."""
     record, recording, rows = samples(duration)
@@ -351,7 +342,7 @@ def main(*, duration: float = 100.0, repeats: int = 5, sources: Path | None = No
                 elif part != "arm" and host and (part, filter_.driver) != ("double", FUSION):
                     columns[f"{part}_ns"] = 1e9 * on_this_machine(filter_, rows, folder, single=part == "single")
             if filter_.kernel is not None:
-                columns["package_ns"] = 1e9 * seconds(filter_.kernel, repeats) / len(rows)
+                columns |= timing.least({"package_ns": (filter_.kernel, len(rows))}, repeats)
             described.append(columns)
     return {"machine": describe(), "missing": missing, "filters": described}
 
@@ -367,11 +358,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     result = main(duration=arguments.duration, repeats=arguments.repeats, sources=arguments.sources)
     print(json.dumps(result["machine"]))
-    print(f"{'':38s}" + "".join(f"{name:>13s}" for name in COLUMNS))
-    for row in result["filters"]:
-        cells = (f"{row[name]:.0f}" if name in row else "" for name in COLUMNS)
-        print(f"{row['name']:38s}" + "".join(f"{cell:>13s}" for cell in cells))
-    for words in result["missing"]:
-        print(f"missing: {words}")
+    cells = [[row["name"], *(row.get(name) for name in COLUMNS)] for row in result["filters"]]
+    print(Table("", ["", *COLUMNS], cells, [f"missing: {words}" for words in result["missing"]]).text)
     if arguments.json:
         write_json(arguments.json, result)

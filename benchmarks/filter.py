@@ -1,31 +1,25 @@
-"""Whole-record filters compared in one process and one thread: ns per sample, and ratios. ``python benchmarks/filter.py``.
+"""Whole-record filters and smoothers compared in one process and one thread: ``python benchmarks/filter.py``.
 
 Each processes the same record: gyro, and a vector per sample (an accelerometer at rest with noise). The filters differ in their states and
-purpose; the table compares only their run time, not their quality.
+purpose; the table compares only their run time, not their quality. A smoother's time includes its run of the filter.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import statistics
-import subprocess
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import timing
+from benchmarks.timing import Work
 from strapdown import ahrs, estimation
 from strapdown.estimation.error_states import GyroScale, VectorBias
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.files import write_json
-from strapdown.kernels.machine import describe
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord, cut
 from strapdown.vectors import VectorMeasurements
@@ -33,6 +27,7 @@ from strapdown.vectors import VectorMeasurements
 RATE = 100.0
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 START = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
+BASE = "strapdown estimation.run, one vector"
 STATES = (
     GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),
     VectorBias(sensor="up", bias_sigma=1e-2),
@@ -41,7 +36,7 @@ STATES = (
 """Filter states: 15 in addition to attitude and bias."""
 
 
-def samples(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np.ndarray]:
+def simulated(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np.ndarray]:
     """Return a record with one or two directions per sample, and the same data as rate, specific force and field."""
     generator = np.random.default_rng(0)
     rate = 0.1 * generator.standard_normal((n, 3))
@@ -79,7 +74,7 @@ def at_edges(record: ImuRecord) -> ImuRecord:
     return replace(record, time=times, increments=share[:, None] * record.increments[interval])
 
 
-def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Callable[[], Any], int]]:
+def with_states(record: ImuRecord, recording: Recording) -> dict[str, Work]:
     """Return the filters with error states: on the record, also with measurements at every 50th sample, and for recordings."""
     n, few = len(record.increments), len(recording.time)
     rare = replace(record, vectors=tuple(series.taken(slice(49, None, 50)) for series in record.vectors))
@@ -101,13 +96,14 @@ def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Call
     }
 
 
-def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Callable[[], Any], int]]:
+def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, Work]:
     """Return the call of each installed peer on the record, and its number of samples (fewer for slow ones)."""
-    calls: dict[str, tuple[Callable[[], Any], int]] = {}
+    calls: dict[str, Work] = {}
     n = len(rate)
     try:
-        from vqf import VQF
+        from vqf import VQF, offlineVQF
 
+        calls["vqf offlineVQF 9D (C++)"] = (lambda: offlineVQF(rate, force, field, 1.0 / RATE), n)
         calls["vqf VQF.updateBatch 6D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force), n)
         calls["vqf VQF.updateBatch 9D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force, field), n)
     except ImportError:
@@ -137,7 +133,7 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
     return calls
 
 
-def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
+def step_by_step(record: ImuRecord, few: int) -> Work:
     """Return a loop of the filterpy interface over the first ``few`` samples."""
 
     def work() -> None:
@@ -147,89 +143,39 @@ def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
             f.predict(record.increments[k], 1.0 / RATE)
             f.update(up, k)
 
-    return work
+    return work, few
 
 
-def import_times(repeats: int = 7) -> tuple[float, float]:
-    """Return median wall times of ``import numpy`` and ``import numpy, strapdown`` in fresh processes, s."""
-
-    def once(what: str) -> float:
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", f"import {what}"], check=True)
-        return time.perf_counter() - start
-
-    pairs = [(once("numpy"), once("numpy, strapdown")) for _ in range(repeats)]
-    return statistics.median(a for a, _ in pairs), statistics.median(b for _, b in pairs)
-
-
-def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
-    """Return ns per sample (median and minimum) of each, the ratios to ours, and the import times."""
-    one_vector, rate, force, field = samples(n, 1)
-    two, *_ = samples(n, 2)
+def main(*, samples: int = 200_000, repeats: int = 7) -> dict[str, float]:
+    """Return the time of each filter, ns per sample."""
+    one_vector, rate, force, field = simulated(samples, 1)
+    two, *_ = simulated(samples, 2)
     between = asynchronous(two)
     edges = at_edges(between)
     gate, robust = Gate(recovery=None), Robust()
-    few = n // 10
-    works = {
-        "strapdown estimation.run, one vector": (lambda: estimation.run(one_vector, NOISE, START), n),
-        "strapdown estimation.run, two vectors": (lambda: estimation.run(two, NOISE, START), n),
-        "strapdown estimation.run, two vectors, asynchronous": (lambda: estimation.run(between, NOISE, START), n),
+    recording = Recording(
+        source="benchmark", time=np.arange(samples) / RATE, rate=rate, specific_force=force, magnetic_field=field
+    )
+    works: dict[str, Work] = {
+        BASE: (lambda: estimation.run(one_vector, NOISE, START), samples),
+        "strapdown estimation.run, two vectors": (lambda: estimation.run(two, NOISE, START), samples),
+        "strapdown estimation.smooth, two vectors": (lambda: estimation.smooth(two, NOISE, START), samples),
+        "strapdown estimation.run, two vectors, asynchronous": (lambda: estimation.run(between, NOISE, START), samples),
         "strapdown estimation.run, the same with gyro samples at their times": (
             lambda: estimation.run(edges, NOISE, START, every=3),
-            n,
+            samples,
         ),
-        "strapdown estimation.run, two vectors, gate": (lambda: estimation.run(two, NOISE, START, gate=gate), n),
+        "strapdown estimation.run, two vectors, gate": (lambda: estimation.run(two, NOISE, START, gate=gate), samples),
         "strapdown estimation.run, two vectors, Student's t": (
             lambda: estimation.run(two, NOISE, START, robust=robust),
-            n,
+            samples,
         ),
-        **with_states(
-            cut(two, 0, few),
-            Recording(
-                source="benchmark",
-                time=np.arange(n) / RATE,
-                rate=rate,
-                specific_force=force,
-                magnetic_field=field,
-            ),
-        ),
+        **with_states(cut(two, 0, samples // 10), recording),
         **peers(rate, force, field),
-        "strapdown StepFilter on filterpy": (step_by_step(one_vector, 1000), 1000),
+        "strapdown StepFilter on filterpy": step_by_step(one_vector, 1000),
     }
-    for work, _ in works.values():
-        work()
-    # Timed in turns, so that a drift of the machine's speed affects all equally.
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(repeats):
-        for name, (work, count) in works.items():
-            start = time.process_time()  # excludes other processes
-            work()
-            times[name].append((time.process_time() - start) / count * 1e9)
-    base = statistics.median(times["strapdown estimation.run, one vector"])
-    rows = [
-        {"name": name, "ns_per_sample": statistics.median(t), "least": min(t), "ratio": statistics.median(t) / base}
-        for name, t in times.items()
-    ]
-    numpy_alone, with_strapdown = import_times()
-    return {
-        "machine": describe(),
-        "samples": n,
-        "rows": rows,
-        "import_seconds": {"numpy": numpy_alone, "numpy and strapdown": with_strapdown},
-    }
+    return timing.least(works, repeats)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, default=200_000)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    result = main(n=arguments.samples, repeats=arguments.repeats)
-    print(json.dumps(result["machine"]))
-    print(f"{'':66s} {'ns/sample':>10s} {'least':>10s} {'ratio':>8s}")
-    for row in result["rows"]:
-        print(f"{row['name']:66s} {row['ns_per_sample']:10.1f} {row['least']:10.1f} {row['ratio']:8.2f}")
-    print({name: round(value, 3) for name, value in result["import_seconds"].items()})
-    if arguments.json:
-        write_json(arguments.json, result)
+    timing.command(main, BASE)

@@ -1,4 +1,4 @@
-"""Filters called once per sample, compared in one process and thread: µs per call, and ratios. ``python benchmarks/live.py``.
+"""Filters called once per sample, compared in one process and thread: ``python benchmarks/live.py``.
 
 Each gets the same samples one at a time, as lists or arrays, whichever is faster for it: gyro, accelerometer, magnetometer. The filters
 differ in their states and purpose; the table compares only their run time. smsfusion and AttiPy use a heading in place of the
@@ -7,22 +7,19 @@ magnetometer. `LiveAhrs` updates its 18 states every 30 ms, with the mean of thr
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
-import statistics
-import time
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import timing
 from strapdown import LiveAhrs, VectorSensor
 from strapdown.estimation import Gate, LiveFilter, ProcessNoise, StepFilter, initial_state
 from strapdown.estimation.error_states import GyroScale
-from strapdown.files import write_json
-from strapdown.kernels.machine import describe
 from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0
@@ -135,41 +132,25 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
     return calls
 
 
-def main(*, n: int = 20_000, repeats: int = 5) -> dict[str, Any]:
-    """Return µs per call (median and minimum) of each, and the ratios to ours with two vectors."""
+def in_turn(call: Call, samples: int) -> timing.Work:
+    """Return the calls with each of the first samples as one."""
+
+    def work() -> None:
+        for k in range(samples):
+            call(k)
+
+    return work, samples
+
+
+def main(*, samples: int = 20_000, repeats: int = 5) -> dict[str, float]:
+    """Return the time of a call of each filter, ns."""
     generator = np.random.default_rng(0)
-    rate = 0.1 * generator.standard_normal((n, 3))
-    force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((n, 3))
-    field = np.array(FIELD) + 0.1 * generator.standard_normal((n, 3))
-    works = {**ours(rate.tolist(), force.tolist(), field.tolist()), **peers(rate, force, field)}
-    for call, _ in works.values():
-        call(0)
-    # Timed in turns, so that a drift of the machine's speed affects all equally.
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(repeats):
-        for name, (call, count) in works.items():
-            start = time.process_time()  # excludes other processes
-            for k in range(count):
-                call(k)
-            times[name].append((time.process_time() - start) / count * 1e6)
-    base = statistics.median(times[OURS])
-    rows = [
-        {"name": name, "us_per_call": statistics.median(t), "least": min(t), "ratio": statistics.median(t) / base}
-        for name, t in times.items()
-    ]
-    return {"machine": describe(), "samples": n, "rows": rows}
+    rate = 0.1 * generator.standard_normal((samples, 3))
+    force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((samples, 3))
+    field = np.array(FIELD) + 0.1 * generator.standard_normal((samples, 3))
+    calls = {**ours(rate.tolist(), force.tolist(), field.tolist()), **peers(rate, force, field)}
+    return timing.least({name: in_turn(*call) for name, call in calls.items()}, repeats)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, default=20_000)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    result = main(n=arguments.samples, repeats=arguments.repeats)
-    print(json.dumps(result["machine"]))
-    print(f"{'':56s} {'µs/call':>9s} {'least':>9s} {'ratio':>8s}")
-    for row in result["rows"]:
-        print(f"{row['name']:56s} {row['us_per_call']:9.2f} {row['least']:9.2f} {row['ratio']:8.2f}")
-    if arguments.json:
-        write_json(arguments.json, result)
+    timing.command(main, OURS)

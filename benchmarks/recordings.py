@@ -18,10 +18,12 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import strapdown as sd
+from benchmarks import timing
 from strapdown.checks import Array
 from strapdown.files import write_json
 from strapdown.recordings import Recording
@@ -199,41 +203,13 @@ def mean(scores: Sequence[Score]) -> Score:
     )
 
 
-def compared(folders: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[str, str, int, Score]]:
-    """Yield set, filter, number of recordings and score."""
-    for folder in folders:
-        recordings = read(folder)
-        for name in names:
-            yield (
-                folder.name,
-                name,
-                len(recordings),
-                mean([score(recording, FILTERS[name][1]) for recording in recordings]),
-            )
-
-
-def least_times(recording: Recording, names: Sequence[str], rounds: int = 7) -> dict[str, float]:
-    """Return the least processor time of each filter, ns per sample; they run in turn, so that the clock of the machine affects all."""
-    least = dict.fromkeys(names, np.inf)
-    for _ in range(rounds):
-        for name in names:
-            begin = time.process_time()
-            FILTERS[name][1](recording)
-            least[name] = min(least[name], 1e9 * (time.process_time() - begin) / len(recording.time))
-    return least
-
-
 def print_times(folders: Sequence[Path], names: Sequence[str]) -> None:
-    """Print the time of each filter on each recording: ns per sample, and relative to VQF."""
-    print(f"{'recording':44s} {'samples':>8s}", *(f"{name:>24s}" for name in names))
+    """Print the time of each filter on each recording."""
     for folder in folders:
         for recording in read(folder):
-            least = least_times(recording, names)
-            usual = least.get("VQF", np.nan)
-            cells = (f"{least[name]:14.0f} ({least[name] / usual:6.2f})" for name in names)
-            print(
-                f"{Path(recording.source).stem:44s} {len(recording.time):8d}", *(f"{c:>24s}" for c in cells), flush=True
-            )
+            works = {name: (partial(FILTERS[name][1], recording), len(recording.time)) for name in names}
+            print(f"{folder.name}, {Path(recording.source).stem}, {len(recording.time)} samples")
+            print(timing.table(timing.least(works), "VQF" if "VQF" in names else names[0]).text, flush=True)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -258,14 +234,17 @@ def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | 
     """Return the scores of filters on sets, added to those known, and print each as soon as it is known."""
     result: dict[str, Any] = {"metric": " ".join(__doc__.split("\n\n")[1].split()), "sets": {}, "filters": {}}
     result.update({key: dict(value) for key, value in (known or {}).items() if key in ("sets", "filters")})
-    for where, name, number, score in compared(folders, names):
-        result["sets"][where] = number
-        result["filters"].setdefault(name, {})[where] = asdict(score)
-        words = [f"{where} ({number})".ljust(14), name.ljust(18)]
-        for values in (score.error_deg, score.coverage):
-            words.append(("" if values is None else "/".join(f"{x:.2f}" for x in values)).rjust(18))
-        words.append("    " if score.nees is None else f"{score.nees:4.2f}")
-        print(*words, f"{score.rows:.3f} {score.us:6.2f}", flush=True)
+    for folder in folders:
+        recordings = read(folder)
+        result["sets"][folder.name] = len(recordings)
+        for name in names:
+            whole = mean([score(recording, FILTERS[name][1]) for recording in recordings])
+            result["filters"].setdefault(name, {})[folder.name] = asdict(whole)
+            words = [f"{folder.name} ({len(recordings)})".ljust(14), name.ljust(18)]
+            for values in (whole.error_deg, whole.coverage):
+                words.append(("" if values is None else "/".join(f"{x:.2f}" for x in values)).rjust(18))
+            words.append("    " if whole.nees is None else f"{whole.nees:4.2f}")
+            print(*words, f"{whole.rows:.3f} {whole.us:6.2f}", flush=True)
     return result
 
 
