@@ -94,9 +94,7 @@ def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, 
     outcomes = tuple(judge(datasheets.PRESETS[name], runs, duration, seed, rate) for name in presets)
     result = Result(outcomes=outcomes, runs=runs, duration=duration)
     if out is not None:
-        page, ax = plots.new_figure(size=(9.0, 4.5))
-        draw(result, ax=ax)
-        plots.save(page, Path(out) / "flicker.png")
+        draw(result, Path(out) / "flicker.png")
     return result
 
 
@@ -202,25 +200,23 @@ def augmented(angle, looks, spec, shaping, every, dt, variance, start):
     return np.array(errors), np.array(variances)
 
 
-def draw(result, *, ax=None):
-    """Draw the mean NEES of each filter by preset; return the matplotlib axes."""
-    ax = plots.new_figure(size=(9.0, 4.5))[1] if ax is None else ax
+def draw(result, path):
+    """Draw the mean NEES of each filter by preset, and write the figure."""
+    figure, ax = plots.new_figure(size=(9.0, 4.5))
     place = np.arange(len(result.outcomes))
     student = t.ppf(0.995, result.runs - 1)
+    words = {"control": "control: a gyro without flicker", "own": "own: flicker not modelled"}
     for number, name in enumerate(FILTERS):
-        value = np.array([outcome.anees[name] for outcome in result.outcomes])
-        bar = student * np.array([outcome.scatter[name] for outcome in result.outcomes])
-        label = {"control": "control: a gyro without flicker", "own": "own: flicker not modelled"}.get(name, name)
-        ax.errorbar(
-            place + 0.15 * (number - 1.5), value, bar, fmt="o", ms=5, capsize=3, color=style.CYCLE[number], label=label
-        )
+        value, scatter = np.array([(outcome.anees[name], outcome.scatter[name]) for outcome in result.outcomes]).T
+        look = {"fmt": "o", "ms": 5, "capsize": 3, "color": style.CYCLE[number], "label": words.get(name, name)}
+        ax.errorbar(place + 0.15 * (number - 1.5), value, student * scatter, **look)
     ax.axhline(1.0, color="k", lw=0.8)
     ax.set_xlim(-0.5, len(place) - 0.5)
     ax.set_xticks(place, [outcome.preset for outcome in result.outcomes])
     ax.set_ylabel("mean NEES of the attitude / 3 (1: consistent)")
     ax.set_title(f"{result.runs} runs of {result.duration:g} s; bars: 99 %")
-    style.legend_below(ax.figure, [ax], ncols=len(FILTERS))
-    return ax
+    style.legend_below(figure, [ax], ncols=len(FILTERS))
+    return plots.save(figure, path)
 
 
 if __name__ == "__main__":

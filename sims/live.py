@@ -58,7 +58,6 @@ class Result:
     """99th percentile of the time from when a gyro sample is due to its estimate, s."""
     late: int
     """Number of measurements delayed beyond the look-back."""
-    figure: Path | None
 
 
 def simulated(duration: float, seed: int) -> ImuRecord:
@@ -94,38 +93,29 @@ def send(due: list[tuple[float, bytes]], address: tuple[str, int], begin: float)
         out.sendto(SAMPLE.pack(END, 0.0, 0.0, 0.0, 0.0), address)
 
 
-class Screen:
-    """Plot of error and σ over the last ten seconds, or over the whole stream."""
+def axes_of(show: bool) -> Any:
+    """Return axes in a window, or in a figure that is saved."""
+    if not show:
+        return plots.new_figure()[1]
+    import matplotlib.pyplot as plt
 
-    def __init__(self, *, show: bool) -> None:
-        self.show = show
-        if show:
-            import matplotlib.pyplot as plt
-
-            self.figure, self.axes = plt.subplots()
-            plt.show(block=False)
-        else:
-            self.figure, self.axes = plots.new_figure()
-        (self.error,) = self.axes.plot([], [], label="error")
-        (self.sigma,) = self.axes.plot([], [], label="σ, all axes")
-        self.axes.set(xlabel="time, s", ylabel="attitude, °", yscale="log")
-        self.axes.legend()
-
-    def draw(self, rows: Array) -> None:
-        """Draw rows of time, error and σ."""
-        for line, values in ((self.error, rows[:, 1]), (self.sigma, rows[:, 2])):
-            line.set_data(rows[:, 0], values / DEGREE)
-        self.axes.relim()
-        self.axes.autoscale_view()
-        if self.show:
-            self.figure.canvas.draw_idle()
-            self.figure.canvas.flush_events()
+    _, axes = plt.subplots()
+    plt.show(block=False)
+    return axes
 
 
-def receive(inlet: socket.socket, live: LiveFilter, record: ImuRecord, begin: float, screen: Screen) -> Any:
+def draw(axes: Any, rows: Array) -> None:
+    """Draw rows of time, error and σ."""
+    axes.clear()
+    axes.plot(rows[:, 0], rows[:, 1] / DEGREE, label="error")
+    axes.plot(rows[:, 0], rows[:, 2] / DEGREE, label="σ, all axes")
+    axes.set(xlabel="time, s", ylabel="attitude, °", yscale="log")
+    axes.legend()
+
+
+def receive(inlet: socket.socket, live: LiveFilter, truth: Array, begin: float, window: Any) -> Any:
     """Filter the stream until its end; return time, error and σ (n, 3), and the durations of updates and samples."""
-    assert record.truth is not None
-    truth, rows, took, behind, drawn = record.truth.attitude, [], [], [], 0.0
+    rows, took, behind, drawn = [], [], [], 0.0
     while True:
         sensor, t, *value = SAMPLE.unpack(inlet.recv(SAMPLE.size))
         if sensor == END:
@@ -141,11 +131,13 @@ def receive(inlet: socket.socket, live: LiveFilter, record: ImuRecord, begin: fl
             continue
         behind.append(end - begin - t)
         if t >= drawn:
-            drawn = t + DRAWN / (1.0 if screen.show else 20.0)
+            drawn = t + (DRAWN if window else DRAWN / 20.0)
             error = quaternion.angle_between(truth[round(t * RATE)], live.attitude)
             rows.append((t, float(error), float(np.sqrt(np.trace(live.covariance[:3, :3])))))
-            if screen.show:
-                screen.draw(np.array(rows[-100:]))
+            if window:
+                draw(window, np.array(rows[-100:]))
+                window.figure.canvas.draw_idle()
+                window.figure.canvas.flush_events()
 
 
 def main(
@@ -154,27 +146,22 @@ def main(
     """Send and filter a stream of ``duration`` seconds. The figure is written to ``out`` if it is given."""
     record = simulated(duration, seed)
     assert record.truth is not None
-    start = sd.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.1, -0.1, 0.2])),
-        attitude_sigma=0.2,
-        bias_sigma=5e-3,
-    )
+    truth = record.truth.attitude
+    start = quaternion.multiply(truth[0], quaternion.exp([0.1, -0.1, 0.2]))
+    initial = sd.initial_state(start, attitude_sigma=0.2, bias_sigma=5e-3)
     noise = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
-    live = LiveFilter(noise, start, sensors=record.vectors, look_back=10.0 * LATENCY)
-    screen, due = Screen(show=show), datagrams(record)
+    live = LiveFilter(noise, initial, sensors=record.vectors, look_back=10.0 * LATENCY)
+    axes, due = axes_of(show), datagrams(record)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inlet:
         inlet.bind(("127.0.0.1", 0))
         inlet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         inlet.settimeout(5.0)
         begin = time.perf_counter() + 0.1
-        unit = threading.Thread(target=send, args=(due, inlet.getsockname(), begin), daemon=True)
-        unit.start()
-        rows, took, behind = receive(inlet, live, record, begin, screen)
-    figure = None
+        threading.Thread(target=send, args=(due, inlet.getsockname(), begin), daemon=True).start()
+        rows, took, behind = receive(inlet, live, truth, begin, axes if show else None)
     if out is not None:
-        screen.draw(rows)
-        Path(out).mkdir(parents=True, exist_ok=True)
-        figure = plots.save(screen.figure, Path(out) / "live.png")
+        draw(axes, rows)
+        plots.save(axes.figure, Path(out) / "live.png")
     return Result(
         time=rows[:, 0],
         error=rows[:, 1],
@@ -182,7 +169,6 @@ def main(
         update=float(np.median(took)),
         behind=float(np.quantile(behind, 0.99)),
         late=live.late,
-        figure=figure,
     )
 
 
