@@ -200,9 +200,12 @@ def run(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     instance("source", source, (ImuRecord, Recording), SOURCE)
     recorded = isinstance(source, Recording)
-    others = ("motion", "latency", "calibration", "temperature")
-    for name in ("setup", "initial", "states", "every") if recorded else others:
-        value = options.pop(name, None) if recorded or name in others else None
+    of_records, of_recordings = (
+        ("setup", "initial", "states", "every"),
+        ("motion", "latency", "calibration", "temperature"),
+    )
+    for name in of_records if recorded else of_recordings:
+        value = options.pop(name, None)
         if value not in (None, False) and not (name == "every" and value == 1):
             raise InputError(f"{Hint(name)} goes with a record{'' if recorded else 'ing'}; leave it out")
     if isinstance(source, Recording):
@@ -228,10 +231,6 @@ def _run_record(
         raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
     filter_setup, notes = filter_for_record(record, noise, setup, initial, states, changes)
     modelled = setups.modelled_record(record, filter_setup)
-    if every > len(modelled.increments):
-        raise InputError(
-            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
-        )
     if initial is None:
         begin = for_record.start(modelled, filter_setup)
     elif isinstance(initial, str) and initial == "truth":
@@ -242,15 +241,15 @@ def _run_record(
         q = array("initial", initial, (4,))  # type: ignore[arg-type]
         if not q.any():
             raise InputError("initial is the zero quaternion; give w, x, y, z of an attitude")
-        begin = for_record.Start(
-            setups.initial_state(filter_setup, quaternion.normalize(q)), "Started from the attitude given."
+        state = setups.initial_state(filter_setup, quaternion.normalize(q))
+        begin = for_record.Start(state, "Started from the attitude given.")
+    steps = len(modelled.increments) - begin.edge
+    if every > steps:
+        raise InputError(
+            f"every is {every}, more than the {steps} filter steps from the start; only the first epoch would be kept"
         )
     if begin.edge > 0:
         modelled = records.cut(modelled, begin.edge, len(modelled.increments))
-        if every > len(modelled.increments):
-            raise InputError(
-                f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
-            )
     full = full_covariance is not False
     if smooth:
         result = setups.smooth_modelled(modelled, filter_setup, begin.state, full_covariance=full)
@@ -292,13 +291,11 @@ def _run_recording(
         notes = [f"Gyro noise, flicker included: {arw:.3g} °/√h, bias random walk {rrw:.3g} °/h/√h."]
     if temperature is not None:
         source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
-    reference = source.true_attitude
-    if reference is not None and source.movement is not None:
-        judged = np.isfinite(reference @ np.ones(4)) & source.movement
-        if not judged.any():
-            raise InputError(
-                f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
-            )
+    reference, movement = source.true_attitude, source.movement
+    if reference is not None and movement is not None and not movement[np.isfinite(reference).all(axis=1)].any():
+        raise InputError(
+            f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
+        )
     full = reference is not None if full_covariance is None else full_covariance
     result = ahrs.estimate(source, parameters, gate=gate, robust=robust, full_covariance=full, smooth=smooth, **options)
     used, parameters = result.recording, result.parameters
@@ -312,10 +309,7 @@ def _run_recording(
         smoothed=smooth,
         remarks=(*remarks(result, motion), *notes),
         details={
-            **{
-                f"parameter.{parameter.name}": getattr(parameters, parameter.name)
-                for parameter in dataclasses.fields(parameters)
-            },
+            **{f"parameter.{field.name}": getattr(parameters, field.name) for field in dataclasses.fields(parameters)},
             "latency": result.delays.gyro,
             "magnetometer_latency": result.delays.last_field,
         },
