@@ -12,6 +12,7 @@ import matplotlib.style
 import numpy as np
 import pytest
 import scipy.stats
+from coning_case import SCENARIO, SETUP, estimated
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -19,15 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from strapdown import (
     allan,
-    coning,
     consistency,
     covariance,
-    gyro,
     montecarlo,
     plots,
     quaternion,
-    records,
-    scenarios,
     units,
 )
 from strapdown.checks import InputError
@@ -40,29 +37,13 @@ pytestmark = pytest.mark.draws
 
 
 @pytest.fixture(scope="module")
-def scenario():
-    spec = gyro.GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
-    return dataclasses.replace(scenarios.load_scenario("coning"), gyro=spec, gyro_preset="", duration=20.0)
+def run():
+    return estimated()
 
 
 @pytest.fixture(scope="module")
-def filter_setup(scenario):
-    return dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario, states=False), integration=coning.ALGORITHMS["four-sample"]
-    )
-
-
-@pytest.fixture(scope="module")
-def run(scenario, filter_setup):
-    record = scenarios.simulate(scenario, 3)
-    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
-    estimate = setup.run(record, filter_setup, start, full_covariance=True)
-    return estimate, records.compress(record, filter_setup.integration).truth
-
-
-@pytest.fixture(scope="module")
-def statistics(scenario, filter_setup):
-    return montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=25, nis_bins=20), runs=24)
+def statistics():
+    return montecarlo.run_plan(montecarlo.Plan(scenario=SCENARIO, setup=SETUP, epochs=25, nis_bins=20), runs=24)
 
 
 @st.composite
@@ -254,9 +235,9 @@ def test_errors_are_drawn_in_the_unit_of_their_label(run):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario):
-    opposite = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
-    brief = dataclasses.replace(scenario, gyro=opposite, duration=2.0)
+def test_a_budget_that_starts_without_error_shows_what_comes_after():
+    opposite = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
+    brief = dataclasses.replace(SCENARIO, gyro=opposite, duration=2.0)
     belief = dataclasses.replace(setup.FilterSetup.for_scenario(brief), states=None)
     analysis = covariance.analyse(brief, belief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
     assert not analysis.rms[0].any()

@@ -10,14 +10,16 @@ import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
+import coning_case
 import numpy as np
 import pytest
 import scipy.stats
+from coning_case import SETUP, estimated
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 import strapdown as sd
-from strapdown import cli, coning, gyro, montecarlo, plots, quaternion, records, report, scenarios
+from strapdown import cli, montecarlo, plots, quaternion, records, report, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
@@ -28,25 +30,7 @@ from strapdown.units import DEGREE_PER_HOUR
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
 import headless
 
-
-@pytest.fixture(scope="module")
-def scenario():
-    spec = gyro.GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
-    return dataclasses.replace(scenarios.load_scenario("coning"), gyro=spec, gyro_preset="", duration=60.0)
-
-
-@pytest.fixture(scope="module")
-def filter_setup(scenario):
-    return dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario, states=False), integration=coning.ALGORITHMS["four-sample"]
-    )
-
-
-def estimate_of(scenario, filter_setup):
-    record = scenarios.simulate(scenario, 3)
-    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
-    estimate = setup.run(record, filter_setup, start, full_covariance=True)
-    return estimate, records.compress(record, filter_setup.integration).truth
+SCENARIO = dataclasses.replace(coning_case.SCENARIO, duration=60.0)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +40,7 @@ def panels():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, scenario, filter_setup, panels):
+def folder(tmp_path_factory, panels):
     """Results: an estimate with truth, one without, one of a filter that is wrong, a campaign; their figures are empty."""
     where, drawn, new = tmp_path_factory.mktemp("results"), [], plots.new_figure
     Figure(figsize=(3.0, 2.0), dpi=100).savefig(where / "empty.png")
@@ -65,16 +49,14 @@ def folder(tmp_path_factory, scenario, filter_setup, panels):
         drawn.append(new(*size, **options))
         return drawn[-1]
 
-    estimate, truth = estimate_of(scenario, filter_setup)
+    estimate, truth = estimated(SCENARIO)
     details = {"command": "a <b> & c", "notes": "x = 1\ny = 2"}
     setup.write_estimate(where / "right.h5", dataclasses.replace(estimate, truth=truth, details=details))
     setup.write_estimate(where / "blind.h5", estimate)
-    wrong, truth = estimate_of(scenario, dataclasses.replace(filter_setup, measurement_sigma_factor=0.3))
+    wrong, truth = estimated(SCENARIO, dataclasses.replace(SETUP, measurement_sigma_factor=0.3))
     origin = records.Origin(source="walk.csv")
     setup.write_estimate(where / "wrong.h5", dataclasses.replace(wrong, truth=truth, origin=origin))
-    plan = montecarlo.Plan(
-        scenario=dataclasses.replace(scenario, duration=20.0), setup=filter_setup, epochs=25, nis_bins=20
-    )
+    plan = montecarlo.Plan(scenario=coning_case.SCENARIO, setup=SETUP, epochs=25, nis_bins=20)
     campaign.run(plan, where / "campaign.h5", runs=16)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plots, "new_figure", kept)
@@ -163,11 +145,11 @@ def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folde
         np.testing.assert_allclose(drawn, wanted, rtol=1e-4, atol=2e-5 * wanted.max())
 
 
-def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
+def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, tmp_path):
     assert "no state for" not in body(folder / "campaign.html")
     assert ">reason<" not in body(folder / "campaign.html")
     held = campaign.read(folder / "campaign.h5")
-    spec = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 0.05))
+    spec = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 0.05))
     plan = dataclasses.replace(held.plan, scenario=dataclasses.replace(held.plan.scenario, gyro=spec))
     campaign.run(plan, tmp_path / "scaled.h5", runs=16)
     content = body(report.write(tmp_path / "scaled.h5").page)
@@ -178,8 +160,8 @@ def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenari
     )
 
 
-def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
-    (tmp_path / "scenario.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
+def test_a_tuning_is_reported_from_its_json(folder, tmp_path):
+    (tmp_path / "scenario.toml").write_text(scenarios.scenario_to_toml(SCENARIO), encoding="utf-8")
     tune = ["tune", str(tmp_path / "record.h5"), "--free", "star 1.sigma", "--starts", "1"]
     tune += ["-o", str(tmp_path / "filter.toml")]
     for command in (
