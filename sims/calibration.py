@@ -23,11 +23,11 @@ import strapdown as sd
 from strapdown import plots, quaternion
 from strapdown.calibration import SensorErrors, UnitCalibration
 from strapdown.checks import Array
-from strapdown.consistency import reference_errors
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots.style import BLUE, VERMILION
 from strapdown.randomness import generator
 from strapdown.recordings import Recording
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE
 
 RATE = 100.0
@@ -130,12 +130,7 @@ def simulated(unit: SensorErrors, seed: int, run: int, duration: float, *, pause
 def attitude_error(recording: Recording, calibration: UnitCalibration | None) -> float:
     """Return the RMS error of the total attitude, rad."""
     estimate = sd.estimate(recording, calibration=calibration, latency=0.0)
-    rows = recording.rows_of(estimate.time)
-    assert recording.true_attitude is not None
-    assert recording.movement is not None
-    return float(
-        reference_errors(estimate.attitude, recording.true_attitude[rows]).rms(recording.movement[rows])["total"]
-    )
+    return sd.accuracy(estimate).given["movement"]["total"].rms
 
 
 def main(*, units: int = 20, duration: float = 120.0, seed: int = 1, out: Path | None = None) -> Result:
@@ -158,9 +153,8 @@ def main(*, units: int = 20, duration: float = 120.0, seed: int = 1, out: Path |
         attitude=np.array(attitude),
     )
     if out is not None:
-        out = Path(out)
         out.mkdir(parents=True, exist_ok=True)
-        (out / "calibration.txt").write_text(table(result) + "\n", encoding="utf-8")
+        (out / "calibration.txt").write_text(table(result).text + "\n", encoding="utf-8")
         draw(result, out / "calibration.png")
     return result
 
@@ -184,15 +178,17 @@ def draw(result: Result, path: Path) -> Path:
     return plots.save(figure, path)
 
 
-def table(result: Result) -> str:
-    """Return the figures as text."""
-    lines = [f"{'error':32s} {'RMS error':>10s} {'σ (RMS)':>10s} {'within 1.96 σ':>14s}"]
-    for name, (words, unit) in GROUPS.items():
-        error, sigma = (np.sqrt(np.mean(x**2)) / unit for x in (result.errors[name], result.sigma[name]))
-        lines.append(f"{words:32s} {error:10.3g} {sigma:10.3g} {result.coverage(name):14.1%}")
-    before, after = np.sqrt(np.mean(result.attitude**2, axis=0)) / DEGREE
-    lines.append(f"attitude of a second recording, RMS: {before:.2f}° without the calibration, {after:.2f}° with it")
-    return "\n".join(lines)
+def table(result: Result) -> Table:
+    """Return errors, σ and coverage as a table."""
+    rms = lambda x: np.sqrt(np.mean(x**2))  # noqa: E731
+    rows = [
+        (words, rms(result.errors[name]) / unit, rms(result.sigma[name]) / unit, result.coverage(name))
+        for name, (words, unit) in GROUPS.items()
+    ]
+    columns = ["error", Column("RMS error", digits=3), Column("σ (RMS)", digits=3), Column("within 1.96 σ", digits=3)]
+    before, after = (rms(column) / DEGREE for column in result.attitude.T)
+    note = f"Attitude of a second recording, RMS: {before:.2f}° without the calibration, {after:.2f}° with it."
+    return Table(f"Calibration of {len(result.attitude)} units", columns, rows, [note])
 
 
 if __name__ == "__main__":
@@ -200,4 +196,4 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("results/calibration"))
     parser.add_argument("--units", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    print(table(main(**vars(parser.parse_args()))))
+    print(table(main(**vars(parser.parse_args()))).text)
