@@ -28,19 +28,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import strapdown as sd
 from benchmarks import timing
+from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.files import write_json
 from strapdown.recordings import Recording
+from strapdown.records import Estimate, Truth
 
 Filter = Callable[[Recording], tuple[Array, Array | None]]
 """Attitude (n, 4), body to a frame with z up, and, if the filter has it, covariance (n, 3, 3) of the error in body axes, rad²."""
-REGION = 0.95
 PARTS = ("total", "heading", "inclination")
 
 
@@ -96,9 +95,8 @@ def madgwick(recording: Recording, *, gain: float = 1.0) -> tuple[Array, None]:
     interval, sensors = samples(recording)
     named = dict(zip(("gyr", "acc", "mag"), sensors, strict=False))
     default = 0.041 if "mag" in named else 0.033
-    quarter = Rotation.from_rotvec([0.0, 0.0, 0.5 * np.pi])  # its own x axis points North
-    own = Rotation.from_quat(Madgwick(**named, Dt=interval, gain=gain * default).Q, scalar_first=True)
-    return np.asarray((quarter * own).as_quat(scalar_first=True)), None
+    quarter = quaternion.exp([0.0, 0.0, 0.5 * np.pi])  # its own x axis points North
+    return quaternion.multiply(quarter, Madgwick(**named, Dt=interval, gain=gain * default).Q), None
 
 
 FILTERS: dict[str, tuple[str, Filter]] = {
@@ -125,55 +123,30 @@ class Score:
 
 
 def score(recording: Recording, run: Filter) -> Score:
-    """Return the score of a filter on a recording."""
+    """Return the score of a filter on a recording, over the movement where reference and attitude are known."""
     begin = time.process_time()
     attitude, covariance = run(recording)
     us = 1e6 * (time.process_time() - begin) / len(recording.time)
-    judged, error = errors(recording, attitude)
-    rows = float(np.mean(np.isfinite(attitude).all(axis=1)))
-    if not judged.any():
-        return Score(None, None, None, rows, us)
-    turn = lengths(error)
-    # Heading about the vertical, then inclination about a level axis: half-angles of the quaternion.
-    w, x, y, z = np.cos(turn / 2.0), *(error * (0.5 * np.sinc(turn / 2.0 / np.pi))[:, None]).T
-    heading, inclination = 2.0 * np.arctan2(np.abs(z), np.abs(w)), 2.0 * np.arcsin(np.clip(np.hypot(x, y), 0.0, 1.0))
-    size = tuple(float(np.degrees(np.sqrt(np.mean(part**2)))) for part in (turn, heading, inclination))
-    if covariance is None:
-        return Score(size, None, None, rows, us)
-    M = matrices(attitude[judged])
-    P = M @ covariance[judged] @ np.swapaxes(M, 1, 2)
-    parts = (np.arange(3), np.array([2]), np.array([0, 1]))
-    nees = [np.einsum("ni,nij,nj->n", error[:, at], np.linalg.inv(P[:, at[:, None], at]), error[:, at]) for at in parts]
-    held = tuple(float(np.mean(n < chi2.ppf(REGION, len(at)))) for n, at in zip(nees, parts, strict=True))
-    return Score(size, held, float(nees[0].mean() / 3.0), rows, us)
-
-
-def errors(recording: Recording, attitude: Array) -> tuple[np.ndarray, Array]:
-    """Return the rows that are judged (n,), and the rotation vectors (m, 3) of their errors in the fixed frame, rad.
-
-    A row is judged if the unit moves there, and reference and attitude are known.
-    """
-    reference = recording.true_attitude
-    assert reference is not None
-    judged = np.isfinite(reference).all(axis=1) & np.isfinite(attitude).all(axis=1)
+    known = np.isfinite(attitude).all(axis=1)
+    rows = float(np.mean(known))
+    assert recording.true_attitude is not None
+    judged = known & np.isfinite(recording.true_attitude).all(axis=1)
     if recording.movement is not None:
         judged &= recording.movement
-    q, r = (Rotation.from_quat(each[judged], scalar_first=True) for each in (attitude, reference))
     if not judged.any():
-        return judged, np.empty((0, 3))
-    e = (q * r.inv()).as_quat(scalar_first=True)
-    offset = np.angle(np.mean(np.exp(2j * np.arctan2(e[:, 3], e[:, 0]))))
-    return judged, (Rotation.from_rotvec([0.0, 0.0, -offset]) * q * r.inv()).as_rotvec()
-
-
-def matrices(attitude: Array) -> Array:
-    """Return rotation matrices (n, 3, 3)."""
-    return np.asarray(Rotation.from_quat(attitude, scalar_first=True).as_matrix())
-
-
-def lengths(vectors: Array) -> Array:
-    """Return the length of each row."""
-    return np.sqrt(np.sum(vectors**2, axis=1))
+        return Score(None, None, None, rows, us)
+    q, reference = attitude[judged], recording.true_attitude[judged]
+    d = quaternion.multiply(q, quaternion.conjugate(reference))
+    offset = np.angle(np.mean(np.exp(2j * np.arctan2(d[:, 3], d[:, 0]))))  # of the heading, constant
+    P = np.full((len(q), 3, 3), np.nan) if covariance is None else covariance[judged]
+    turned = quaternion.multiply(quaternion.exp([0.0, 0.0, -offset]), q)
+    estimate = Estimate.from_arrays(recording.time[judged], turned, P)
+    sizes = sd.accuracy(estimate, Truth.of_reference(reference)).given["all samples"]
+    errors, held = ([size[k] for size in sizes.values()] for k in (0, 3))
+    error_deg = tuple(np.degrees(errors).tolist())
+    if covariance is None:
+        return Score(error_deg, None, None, rows, us)
+    return Score(error_deg, tuple(held), sizes["total"].rms_over_sigma ** 2, rows, us)
 
 
 def read(folder: Path) -> list[Recording]:

@@ -5,6 +5,7 @@ as a reader would give it, and so many seconds.
 """
 
 import ast
+import dataclasses
 import json
 import os
 import subprocess
@@ -14,7 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import recordings as leaderboard
 from sims import coning_algorithms as sim
+from sims import hand_held
+from strapdown import quaternion
 
 ROOT = Path(__file__).resolve().parents[1]
 SIMS = sorted((ROOT / "sims").glob("*.py"))
@@ -100,3 +104,22 @@ def test_a_verdict_names_what_was_lost(monkeypatch):
     comparison.drift["two-sample"][0, 0] = 0.0
     assert [place.split(": ")[-1] for place in sim.lost(comparison, "matched-2-8", "drift")] == ["two-sample"]
     assert sim.lost(comparison, "matched-2-8", "periodic") == []
+
+
+def test_the_regions_of_the_leaderboard_are_those_of_any_heading_of_the_reference():
+    """The covariance is rotated with the heading offset that is removed; of an error about one level axis, and its σ about the other."""
+    unit = hand_held.simulated(1, 0, 4.0)
+    attitude = quaternion.multiply(unit.true_attitude, quaternion.exp([0.05, 0.0, 0.0]))
+    covariance = np.broadcast_to(np.diag([1e-4, 1e-2, 1e-2]), (len(unit.time), 3, 3))
+    scores = [
+        leaderboard.score(
+            dataclasses.replace(unit, true_attitude=quaternion.multiply(quaternion.exp(turn), unit.true_attitude)),
+            lambda _: (attitude, covariance),
+        )
+        for turn in ([0.0, 0.0, 0.0], [0.0, 0.0, 0.5 * np.pi])
+    ]
+    for score in scores:
+        np.testing.assert_allclose(score.error_deg, scores[0].error_deg)
+        np.testing.assert_allclose(score.coverage, scores[0].coverage)
+        np.testing.assert_allclose(score.nees, scores[0].nees)
+    assert scores[0].coverage[0] == 0.0
