@@ -44,6 +44,7 @@ from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
 from strapdown.records.outputs import euler
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 SMALL = {"runs": 3, "duration": 4.0}
@@ -255,24 +256,21 @@ def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
     datasheet_noise = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
     noise = float(GYRO.angle_random_walk)
     scene, steady = flight(duration), flight(duration, GyroSpec(angle_random_walk=noise))
+    mended = AttiPy(datasheet_noise, mended=True, name="attipy-mended")
+    fixed = AidedIns(datasheet_noise, read_as="fixed", name="smsfusion-fixed")
     by_name: dict[str, tuple[str, scenarios.Scenario, Any]] = {
-        "smsfusion": ("smsfusion", scene, AidedIns(datasheet_noise))
+        "smsfusion": ("smsfusion", scene, AidedIns(datasheet_noise)),
+        "AttiPy": ("attipy", scene, AttiPy(datasheet_noise)),
+        "AttiPy, heading's derivative mended": ("attipy", scene, mended),
+        "GTSAM": ("gtsam", steady, Gtsam(noise)),
+        "smsfusion, covariance read as fixed": ("smsfusion", scene, fixed),
+        "GTSAM, gyro with a bias": ("gtsam", scene, Gtsam(noise, name="gtsam-bias")),
     }
-    by_name["AttiPy"] = ("attipy", scene, AttiPy(datasheet_noise))
-    by_name["AttiPy, heading's derivative mended"] = (
-        "attipy",
-        scene,
-        AttiPy(datasheet_noise, mended=True, name="attipy-mended"),
-    )
-    by_name["GTSAM"] = ("gtsam", steady, Gtsam(noise))
     if importlib.util.find_spec("smsfusion") is not None:
         from smsfusion import constants
 
         datasheet = AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet")
         by_name["smsfusion, noises of another sensor"] = ("smsfusion", scene, datasheet)
-    fixed = AidedIns(datasheet_noise, read_as="fixed", name="smsfusion-fixed")
-    by_name["smsfusion, covariance read as fixed"] = ("smsfusion", scene, fixed)
-    by_name["GTSAM, gyro with a bias"] = ("gtsam", scene, Gtsam(noise, name="gtsam-bias"))
     return {name: case for name, case in by_name.items() if importlib.util.find_spec(case[0]) is not None}
 
 
@@ -337,19 +335,18 @@ def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
     }
 
 
-def table(result: Result) -> str:
-    """Return the peers' σ and their RMS errors as a table in Markdown."""
-    lines = [
-        "| filter | ANEES state | attitude | bias | RMS/σ attitude x, y, z | RMS/σ bias x, y, z | verdict |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def table(result: Result) -> Table:
+    """Return the peers' σ and their RMS errors as a table."""
+    lines = []
     for name, statistics in result.statistics.items():
         row = rows(statistics)
         ratio = np.array(row["rms_si"]) / np.array(row["sigma_si"])
-        anees = [f"{row['anees'][part]:.3g}" if part in row["anees"] else "" for part in ("state", "attitude", "bias")]
         ratios = [", ".join(f"{x:.3g}" for x in part) for part in (ratio[:3], ratio[3:])]
-        lines.append(f"| {' | '.join([name, *anees, *ratios, result.judgements[name].verdict])} |")
-    return "\n".join(lines)
+        anees = [row["anees"].get(part) for part in ("state", "attitude", "bias")]
+        lines.append((name, *anees, *ratios, result.judgements[name].verdict))
+    columns = [Column(f"ANEES {part}", digits=3) for part in ("state", "attitude", "bias")]
+    axes = ("RMS/σ attitude x y z", "RMS/σ bias x y z")
+    return Table("Filters of other packages", ["filter", *columns, *axes, "verdict"], lines)
 
 
 def _frames(plan: montecarlo.Plan, runs: int) -> dict[str, float]:
@@ -377,11 +374,10 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/peer_judged"))
-    arguments = parser.parse_args()
-    result = main(runs=arguments.runs, seed=arguments.seed, out=arguments.out)
-    print(table(result) if result.statistics else "No peer is installed: pip install smsfusion attipy gtsam")
+    result = main(**vars(parser.parse_args()))
+    print(table(result).text if result.statistics else "No peer is installed: pip install smsfusion attipy gtsam")
     for name, judgement in result.judgements.items():
         print(f"\n{name}: {judgement.words}")
     if result.frame_probability:
-        said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in result.frame_probability.items())
-        print(f"\nDefinition of the attitude error in smsfusion's covariance: {said}.")
+        words = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in result.frame_probability.items())
+        print(f"\nDefinition of the attitude error in smsfusion's covariance: {words}.")
