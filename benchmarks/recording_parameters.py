@@ -14,11 +14,12 @@ from __future__ import annotations
 import argparse
 import functools
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -46,30 +47,19 @@ MIN_COVERAGE = 0.88
 """Minimum coverage of the total, mean over a set, with which parameters are chosen."""
 
 
-@contextmanager
-def changed(module: Any, **values: Any) -> Iterator[None]:
-    """Set constants of a module for a while."""
-    before = {name: getattr(module, name) for name in values}
-    vars(module).update(values)
-    try:
-        yield
-    finally:
-        vars(module).update(before)
-
-
-PARTS: dict[str, Callable[[AhrsParameters], AhrsParameters] | tuple[Any, dict[str, Any]]] = {
-    "nothing": lambda p: p,
-    "bounded velocity (white acceleration instead)": lambda p: replace(p, velocity_sigma=0.0, specific_force_noise=0.6),
-    "gyro scale and misalignment": lambda p: replace(p, gyro_scale_sigma=0.0),
-    "level of the motion": lambda p: replace(p, usual_variation=0.0),
+PARTS: dict[str, dict[str, float] | tuple[Any, dict[str, Any]]] = {
+    "nothing": {},
+    "bounded velocity (white acceleration instead)": {"velocity_sigma": 0.0, "specific_force_noise": 0.6},
+    "gyro scale and misalignment": {"gyro_scale_sigma": 0.0},
+    "level of the motion": {"usual_variation": 0.0},
     "accelerometer bias that rest shows": (starting, {"MAX_DEVIATION": np.inf}),
-    "accelerometer bias": lambda p: replace(p, accelerometer_bias_sigma=0.0),
-    "drift of the gyro's bias": lambda p: replace(p, rate_random_walk=0.0),
-    "hard iron": lambda p: replace(p, hard_iron_sigma=0.0),
-    "deviation of the field": lambda p: replace(p, field_deviation=1e3),
+    "accelerometer bias": {"accelerometer_bias_sigma": 0.0},
+    "drift of the gyro's bias": {"rate_random_walk": 0.0},
+    "hard iron": {"hard_iron_sigma": 0.0},
+    "deviation of the field": {"field_deviation": 1e3},
     "gaps filled by interpolation": (sensor_faults, {"interpolated": lambda *_: []}),
 }
-"""What is left out of the model."""
+"""What is left out of the model: parameters, or names of a module, with other values."""
 
 
 @dataclass(frozen=True)
@@ -159,14 +149,12 @@ def parts(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
     """Return the scores without each part: the geometric mean of the errors, and the mean coverage of the total."""
     result = {}
     for name, part in PARTS.items():
+        changes, module = ({}, patch.multiple(part[0], **part[1])) if isinstance(part, tuple) else (part, nullcontext())
         scores = []
-        for group in those:
-            parameters = ahrs.of_motion("hand", magnetometer=group.magnetometer, smooth=smooth)
-            with changed(
-                *(part[:1] if isinstance(part, tuple) else [sensor_faults]),
-                **(part[1] if isinstance(part, tuple) else {}),
-            ):
-                scores.append(scored(group, parameters if isinstance(part, tuple) else part(parameters), smooth=smooth))
+        with module:
+            for group in those:
+                parameters = ahrs.of_motion("hand", magnetometer=group.magnetometer, smooth=smooth)
+                scores.append(scored(group, replace(parameters, **changes), smooth=smooth))
         held = float(np.mean([score["coverage"] for score in scores]))
         result[name] = {"ratio": geometric_mean(scores), "coverage": held}
         print("smoothed" if smooth else "online", "without", name, result[name], flush=True)
