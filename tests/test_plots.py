@@ -46,6 +46,16 @@ def statistics():
     return montecarlo.run_plan(montecarlo.Plan(scenario=SCENARIO, setup=SETUP, epochs=25, nis_bins=20), runs=24)
 
 
+def heights(band):
+    """Heights of the corners of a filled band."""
+    return band.get_paths()[0].vertices[:, 1]
+
+
+def limits(span):
+    """Lower and upper end of a horizontal span."""
+    return [span.get_y(), span.get_y() + span.get_height()]
+
+
 @st.composite
 def uneven_series(draw):
     """Times that never go back, with bursts and gaps, values with NaN among them, and a number of columns."""
@@ -103,7 +113,7 @@ def test_the_band_of_a_long_record_is_the_envelope_of_sigma():
     error[0, 123_456] = 42.0
     _, ax = plots.new_figure()
     plots.errors_in_envelope(time, error, sigma, ax)
-    dark, upper, lower = (band.get_paths()[0].vertices[:, 1] for band in ax.collections)
+    dark, upper, lower = (heights(band) for band in ax.collections)
     assert np.unique(dark.round(9)).tolist() == pytest.approx([-3.0, 3.0])
     assert np.unique(upper.round(9)).tolist() == pytest.approx([3.0, 3.0 * 1.99])
     assert np.unique(lower.round(9)).tolist() == pytest.approx([-3.0 * 1.99, -3.0])
@@ -138,7 +148,7 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, mo
     degrees = np.median(statistics.sensor_degrees.sum(axis=0))
     span = plots.nis_over_time([("filter", statistics)]).patches[0]
     bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
-    np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], bounds)
+    np.testing.assert_allclose(limits(span), bounds)
     nees = plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias").lines[0].get_ydata()
     with pytest.raises(InputError, match="did you mean 'attitude'"):
         plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "atitude")
@@ -189,7 +199,7 @@ def test_an_allan_deviation_is_drawn_with_the_terms_of_its_axis():
             term.replace("_", " ") for term, held in zip(fit.terms, fit.supported[axis], strict=True) if held
         ]
         np.testing.assert_allclose(ax.lines[0].get_ydata() * size, deviation.deviation[axis])
-        ends = ax.collections[0].get_paths()[0].vertices[:, 1] * size
+        ends = heights(ax.collections[0]) * size
         finite = deviation.upper[axis][np.isfinite(deviation.upper[axis])]
         np.testing.assert_allclose([ends.min(), ends.max()], [deviation.lower[axis].min(), finite.max()])
 
@@ -199,7 +209,7 @@ def test_coning_errors_are_those_about_the_cones_axis(outcomes):
     axes = plots.coning_errors(outcomes).axes
     for ax, state, size in ((axes[0], 2, units.ARCSECOND), (axes[2], 5, units.DEGREE_PER_HOUR)):
         np.testing.assert_allclose(ax.lines[1].get_ydata() * size, held.example_error[0, :, state])
-        top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
+        top = heights(ax.collections[0]).max()
         assert top * size == pytest.approx(3.0 * held.sigma[:, state].max())
 
 
@@ -216,7 +226,7 @@ def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
     np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
     for k, span in enumerate(ax.patches, start=1):
         ends = scipy.stats.binom.ppf([0.005, 0.995], 24, 2.0 * scipy.stats.norm.cdf(k) - 1.0) / 24
-        np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], 100.0 * ends, rtol=1e-9)
+        np.testing.assert_allclose(limits(span), 100.0 * ends, rtol=1e-9)
 
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
@@ -230,7 +240,7 @@ def test_errors_are_drawn_in_the_unit_of_their_label(run):
         assert ax.get_ylabel() == f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}, {unit}"
         drawn = ax.lines[-1].get_ydata()
         assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, state]).max() / size)
-        top = max(part.get_paths()[0].vertices[:, 1].max() for part in ax.collections)
+        top = max(heights(part).max() for part in ax.collections)
         assert top == pytest.approx(3.0 * estimate.sigma[:, state].max() / size, rel=0.02)  # or no lighter part
 
 
@@ -357,9 +367,9 @@ def test_the_estimate_is_drawn_in_the_unit_of_its_axis(run):
     for k, (line, band) in enumerate(zip(axes[3].lines, axes[3].collections, strict=True)):
         assert line.get_ydata()[-1] * size == pytest.approx(estimate.bias[-1, k], rel=1e-12)
         top = np.max(estimate.bias[:, k] + 3.0 * estimate.sigma[:, 3 + k])
-        assert band.get_paths()[0].vertices[:, 1].max() * size == pytest.approx(top)
+        assert heights(band).max() * size == pytest.approx(top)
     assert axes[4].get_ylabel() == "attitude σ, arcsec"
-    top = axes[4].collections[0].get_paths()[0].vertices[:, 1].max() * units.ARCSECOND
+    top = heights(axes[4].collections[0]).max() * units.ARCSECOND
     assert top == pytest.approx(np.linalg.norm(estimate.sigma[:, :3], axis=1).max())
 
 
@@ -384,7 +394,7 @@ def test_errors_of_a_recording_are_drawn_about_the_fixed_axes_with_sign_and_sigm
             drawn = ax.lines[-1].get_ydata()
             assert np.nanmax(drawn) == pytest.approx(value)
             assert np.nanmin(drawn) == pytest.approx(value)
-            assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(3.0 * sigma)
+            assert heights(ax.collections[0]).max() == pytest.approx(3.0 * sigma)
             assert ax.get_ylim()[1] > abs(value)
 
 
@@ -447,7 +457,7 @@ def test_judged_epochs_are_marked_and_their_bounds_drawn(statistics, outcomes):
     np.testing.assert_array_equal(judged.get_xdata(), statistics.time[statistics.judged_epochs])
     low, high = statistics.verdict(outcomes[0].epochs, "attitude", 0.99).simultaneous_bounds
     band = next(patch for patch in ax.patches if "99 %" in patch.get_label())
-    np.testing.assert_allclose([band.get_y(), band.get_y() + band.get_height()], [low, high])
+    np.testing.assert_allclose(limits(band), [low, high])
 
 
 def test_different_scales_side_by_side_are_marked():
