@@ -44,9 +44,8 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         sigma = np.sqrt(np.mean(analysis.filter_sigma[:, part] ** 2, axis=1))
         # The unit is chosen for the converged filter; the initial σ is orders of magnitude larger.
         unit, size = (angle_unit if column == 0 else rate_unit)(rms[len(rms) // 2 :])
-        top.plot(
-            analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="RMS error"
-        )
+        error = np.where(rms > 0.0, rms / size, np.nan)
+        top.plot(analysis.time, error, color=VERMILION, linewidth=2.4, label="RMS error")
         top.plot(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="σ of the filter")
         log_scale(top)
         top.set_ylabel(f"{what} error, one axis, {unit}")
@@ -54,12 +53,8 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         rest = 1.0 - np.sum(list(shown.values()), axis=0)
         if _largest(rest) > 1e-3:
             shown["all others"] = np.maximum(rest, 0.0)
-        stack = bottom.stackplot(
-            analysis.time,
-            100.0 * np.array(list(shown.values())),
-            colors=[colours.get(name, "0.85") for name in shown],
-            linewidth=0.0,
-        )
+        filling = [colours.get(name, "0.85") for name in shown]
+        stack = bottom.stackplot(analysis.time, 100.0 * np.array(list(shown.values())), colors=filling, linewidth=0.0)
         handles.update(zip(shown, stack, strict=True))
         bottom.set(ylim=(0.0, 100.0), xlim=(analysis.time[0], analysis.time[-1]), xlabel="time, s")
         bottom.set_ylabel(f"fraction of mean square {what} error, %")
@@ -86,7 +81,6 @@ def _shares(analysis: Analysis, part: slice) -> dict[str, Array]:
         share["fixed errors"] = np.sum(analysis.mean_error[:, part] ** 2, axis=1) / total
     for k, name in enumerate(analysis.considered):
         key = name.partition(",")[0]
-        share[key] = (
-            share.get(key, np.zeros(len(total))) + np.sum(analysis.considered_errors[:, k, part] ** 2, axis=1) / total
-        )
+        square = np.sum(analysis.considered_errors[:, k, part] ** 2, axis=1)
+        share[key] = share.get(key, np.zeros(len(total))) + square / total
     return share

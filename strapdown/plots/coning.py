@@ -27,13 +27,8 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     low, high = min(shown, default=ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
     ax.set_yscale("log")
     ax.set(xlim=(-0.6, len(drifts) - 0.4), ylim=(low, high))
-    ax.bar(
-        places,
-        np.where(measured > ROUNDING, measured, np.nan),
-        width=0.55,
-        color=style.SKY,
-        label="measured relative to the closed form",
-    )
+    bars = np.where(measured > ROUNDING, measured, np.nan)
+    ax.bar(places, bars, width=0.55, color=style.SKY, label="measured relative to the closed form")
     lines = np.where(predicted > ROUNDING, predicted, np.nan)
     ax.hlines(lines, places - 0.36, places + 0.36, color=style.ink(), linewidth=2, label="predicted by the formula")
     for place, value, line in zip(places, measured, lines, strict=True):
@@ -69,10 +64,11 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
             errors_in_envelope(s.time, s.example_error[:, :, state] / unit, s.sigma[:, state] / unit, ax)
         verdict = outcome.judgement.verdict
         axes[0, j].set_title(f"{outcome.integration}:\n{verdict}", loc="left")
-        late = s.sigma[len(s.time) // 10 :]
-        axes[0, j].set_ylim(-1.3 * 3.0 * late[:, 2].max() / ARCSECOND, 1.3 * 3.0 * late[:, 2].max() / ARCSECOND)
-        top = max(1.6 * 3.0 * late[:, 5].max(), 1.25 * float(np.abs(s.example_error[:, len(s.time) // 10 :, 5]).max()))
-        axes[1, j].set_ylim(-top / DEGREE_PER_HOUR, top / DEGREE_PER_HOUR)
+        late = slice(len(s.time) // 10, None)
+        attitude = 1.3 * 3.0 * s.sigma[late, 2].max() / ARCSECOND
+        axes[0, j].set_ylim(-attitude, attitude)
+        bias = max(1.6 * 3.0 * s.sigma[late, 5].max(), 1.25 * float(np.abs(s.example_error[:, late, 5]).max()))
+        axes[1, j].set_ylim(-bias / DEGREE_PER_HOUR, bias / DEGREE_PER_HOUR)
         axes[0, j].set_xlabel("")
     for row in axes:
         style.match_scales(row)
@@ -95,18 +91,11 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
         bounds = first.statistics.verdict(first.epochs, subset).simultaneous_bounds
         nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
-        ax.plot(
-            first.statistics.time[first.epochs],
-            np.full(len(first.epochs), 0.015),
-            "|",
-            color=style.ink(),
-            markersize=5,
-            transform=ax.get_xaxis_transform(),
-            label="judged epoch",
-        )
-        ax.set_title(
-            f"{subset.capitalize()}: {_passing(outcomes, 'ANEES', subset)}\nTest of the judged epochs", loc="left"
-        )
+        epochs = first.statistics.time[first.epochs]
+        below = {"transform": ax.get_xaxis_transform(), "color": style.ink(), "markersize": 5}
+        ax.plot(epochs, np.full(len(epochs), 0.015), "|", label="judged epoch", **below)
+        passing = _passing(outcomes, "ANEES", subset)
+        ax.set_title(f"{subset.capitalize()}: {passing}\nTest of the judged epochs", loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
     nis_over_time(named, axes[2], label=f"NIS: {percent} bounds, each interval")

@@ -39,14 +39,10 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
         ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **light)
         ax.fill_between(edges, -most, -least, **light)
     ax.axhline(0.0, color=style.ink(), linewidth=0.6)
-    for k, component in enumerate(error):
-        ax.plot(
-            *decimated(time, component),
-            color=style.VERMILION,
-            linewidth=0.8,
-            alpha=0.8,
-            label=f"error, {len(error)} runs" if k == 0 and len(error) > 1 else "error" if k == 0 else None,
-        )
+    label: str | None = f"error, {len(error)} runs" if len(error) > 1 else "error"
+    for component in error:
+        ax.plot(*decimated(time, component), color=style.VERMILION, linewidth=0.8, alpha=0.8, label=label)
+        label = None
     ax.set_xlim(time[0], time[-1])
     ax.set_xlabel("time, s")
     return ax
@@ -82,9 +78,8 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
     """Draw roll, pitch and yaw (sequence Z-Y-X), and if they are known the gyro bias with its ±3σ and the attitude's σ over time."""
     heights = [1.0, 1.0, 1.0, *[1.7] * estimate.has_bias, *[1.3] * estimate.has_covariance]
-    figure, axes = style.new_figure(
-        len(heights), 1, size=(9.0, 10.0 * sum(heights) / 6.0), sharex=True, height_ratios=heights
-    )
+    size = (9.0, 10.0 * sum(heights) / 6.0)
+    figure, axes = style.new_figure(len(heights), 1, size=size, sharex=True, height_ratios=heights)
     for ax, angle, name in zip(axes, roll_pitch_yaw(estimate.attitude).T, angle_labels(fixed_frame), strict=False):
         ax.plot(*unbroken(estimate.time, angle), color=style.BLUE, linewidth=0.9)
         ax.set_ylabel(f"{name.split()[0]}, °")
@@ -111,9 +106,8 @@ def _bias(ax: Axes, estimate: Estimate) -> None:
         bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, k] / size
         bounds = envelope(estimate.time, bias - spread, bias + spread)
         ax.fill_between(*bounds, color=style.CYCLE[k], alpha=0.18, linewidth=0)
-        ax.plot(
-            *decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
-        )
+        label = f"{name}, band {THREE_SIGMA}"
+        ax.plot(*decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=label)
     ax.set_ylim(-1.2 * reach / size, 1.2 * reach / size)
     ax.set_ylabel(f"gyro bias, {unit}")
     style.legend_above(ax)

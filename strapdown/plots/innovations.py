@@ -25,14 +25,8 @@ def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
     z = whitened[np.isfinite(whitened)]
     number = int(np.clip(np.sqrt(len(z)), 12, 80))
     edges = np.linspace(-HISTOGRAM_REACH, HISTOGRAM_REACH, number + 1)
-    ax.hist(
-        np.clip(z, -HISTOGRAM_REACH, HISTOGRAM_REACH),
-        bins=edges.tolist(),
-        density=True,
-        color=SKY,
-        edgecolor="none",
-        label=f"{len(z)} innovations",
-    )
+    clipped, words = np.clip(z, -HISTOGRAM_REACH, HISTOGRAM_REACH), f"{len(z)} innovations"
+    ax.hist(clipped, bins=edges.tolist(), density=True, color=SKY, edgecolor="none", label=words)
     x = np.linspace(-HISTOGRAM_REACH, HISTOGRAM_REACH, 401)
     ax.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), color=ink(), linewidth=1.4, label="standard normal")
     beyond = int(np.sum(np.abs(z) > HISTOGRAM_REACH))
@@ -51,13 +45,8 @@ def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) 
     width = 0.7 / number
     for k in range(number):
         places = lags + (k - 0.5 * (number - 1)) * width
-        ax.bar(
-            places,
-            result.values[:, k],
-            width=width,
-            color=CYCLE[k % len(CYCLE)],
-            label=AXES[k] if number > 1 else "innovations",
-        )
+        label = AXES[k] if number > 1 else "innovations"
+        ax.bar(places, result.values[:, k], width=width, color=CYCLE[k % len(CYCLE)], label=label)
     percent = f"{100 * result.probability:g} %"
     for bounds, style, name in (
         (result.bounds, ":", f"{percent} bounds, each lag"),

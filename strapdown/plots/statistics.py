@@ -135,13 +135,8 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
     for k, expected in enumerate(COVERED):
         low, high = binom.ppf([0.005, 0.995], runs, expected) / runs
         ax.axhspan(100 * low, 100 * high, color=style.CYCLE[k], alpha=0.2, linewidth=0)
-        ax.plot(
-            range(6),
-            100 * statistics.covered[epoch, :, k],
-            "o",
-            color=style.CYCLE[k],
-            label=f"within {k + 1}σ, expected {100 * expected:.1f} %",
-        )
+        words = f"within {k + 1}σ, expected {100 * expected:.1f} %"
+        ax.plot(range(6), 100 * statistics.covered[epoch, :, k], "o", color=style.CYCLE[k], label=words)
     ax.set_xticks(range(6), STATES, rotation=20)
     ax.grid(visible=False, axis="x")
     ax.plot([], [], color=style.ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
@@ -171,21 +166,12 @@ def covariance_ellipses(claimed: Array, actual: Array, pair: tuple[int, int] = (
     for name, matrix, look in styles:
         P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)
         value, vector = np.linalg.eigh(P)
-        ax.add_patch(
-            Ellipse(
-                (0.0, 0.0),
-                *(2.0 * reach * np.sqrt(np.maximum(value, 0.0))),
-                angle=float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0]))),
-                facecolor="none",
-                label=name,
-                **look,
-            )
-        )
+        axes = 2.0 * reach * np.sqrt(np.maximum(value, 0.0))
+        angle = float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0])))
+        ax.add_patch(Ellipse((0.0, 0.0), *axes, angle=angle, facecolor="none", label=name, **look))
     spread = 1.25 * reach * np.array(largest) / scale
-    ax.set_xlim(-spread[0], spread[0])
-    ax.set_ylim(-spread[1], spread[1])
-    ax.set_xlabel(f"{STATES[i]} error, {unit_i}")
-    ax.set_ylabel(f"{STATES[j]} error, {unit_j}")
+    ax.set(xlim=(-spread[0], spread[0]), ylim=(-spread[1], spread[1]))
+    ax.set(xlabel=f"{STATES[i]} error, {unit_i}", ylabel=f"{STATES[j]} error, {unit_j}")
     ax.set_title("95 % ellipses", loc="left")
     style.legend_above(ax)
     return ax

@@ -18,15 +18,8 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullLocator
 from strapdown.checks import one_of
 from strapdown.files import atomic_write
 
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#F0E442",
-)
+BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PURPLE, SKY, YELLOW = "#CC79A7", "#56B4E9", "#F0E442"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 AXES = ("x", "y", "z")
 

@@ -23,14 +23,8 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
     if not tuning.composite:
         ax.axhline(3.84, color=style.ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
     lower, upper = max(parameter.lower / unit.factor, values[0]), min(parameter.upper / unit.factor, values[-1])
-    ax.axvspan(
-        lower,
-        upper,
-        color=style.SKY,
-        alpha=0.3,
-        linewidth=0,
-        label="95 % interval" if parameter.identified else "below the 95 % bound",
-    )
+    words = "95 % interval" if parameter.identified else "below the 95 % bound"
+    ax.axvspan(lower, upper, color=style.SKY, alpha=0.3, linewidth=0, label=words)
     ax.axvline(parameter.value / unit.factor, color=style.BLUE, linewidth=0.8, label="tuned")
     before = parameter.start / unit.factor
     drawn = values[0] <= before <= values[-1]
@@ -55,15 +49,13 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
     number = len(tuning.parameters)
     columns = min(number, 4)
     rows = -(-number // columns)
-    figure, axes = style.new_figure(
-        rows, columns, size=(1.0 + 3.0 * columns, 0.7 + 2.7 * rows), squeeze=False, sharey=True
-    )
-    for k, ax in enumerate(axes.ravel()):
-        if k >= number:
-            ax.set_visible(False)
-            continue
-        likelihood_slice(slices, tuning, k, ax)
-        if k % columns == 0:
-            ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
+    size = (1.0 + 3.0 * columns, 0.7 + 2.7 * rows)
+    figure, axes = style.new_figure(rows, columns, size=size, squeeze=False, sharey=True)
+    for k in range(number):
+        likelihood_slice(slices, tuning, k, axes.flat[k])
+    for ax in axes.flat[number:]:
+        ax.set_visible(False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
     style.legend_below(figure, list(axes.ravel()), ncols=5)
     return figure
