@@ -31,6 +31,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
     name = held.plan.scenario.name or "a scenario"
+    shown = {k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}
     content = page.page(
         f"Monte Carlo: {name}",
         f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.identity.version}",
@@ -40,10 +41,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.section("Over time", *_over_time(statistics, judgement)),
         page.section("At the end", page.figure(lambda: _end(statistics), ending)),
         _worst(statistics, path),
-        page.section(
-            "Provenance",
-            page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
-        ),
+        page.section("Provenance", page.provenance(shown)),
     )
     estimated = len(_estimated(statistics))
     table = {
@@ -55,14 +53,11 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         "anees": {name: statistics.anees[:, SUBSETS[name][0]] for name in statistics.subsets},
         "rms_error_si": statistics.rms_error[:, :estimated],
         "sigma_si": statistics.sigma[:, :estimated],
-        **(
-            {}
-            if bound is None
-            else {"rms_over_root_cramer_rao_bound": verdicts.efficiency(statistics, bound)[:, :estimated]}
-        ),
         "nis_by_sensor": dict(zip(statistics.sensors, statistics.sensor_nis, strict=True)),
         "worst_runs": statistics.worst_run,
     }
+    if bound is not None:
+        table["rms_over_root_cramer_rao_bound"] = verdicts.efficiency(statistics, bound)[:, :estimated]
     return content, plain(table)
 
 
@@ -88,18 +83,12 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
     for k, name in enumerate(_estimated(statistics)):
         sigma = statistics.sigma[:, k]
         unit, size = state_unit(k, 3.0 * statistics.sigma[settled, k // 3 * 3 : k // 3 * 3 + 3])
-        quantiles = [
-            page.Series(
-                label=f"{100 * share:g} % of the runs",
-                value=statistics.error_quantile(share)[:, k] / size,
-                colour=colour,
-            )
-            for share, colour in ((0.99, "--a"), (0.5, "--c"))
-        ]
-        predicted = [
-            page.Series(label=f"{100 * share:g} % by the filter", value=factor * sigma / size, colour=colour, dash=True)
-            for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c"))
-        ]
+        quantiles, predicted = [], []
+        for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c")):
+            words, value = f"{100 * share:g} %", statistics.error_quantile(share)[:, k] / size
+            quantiles.append(page.Series(label=f"{words} of the runs", value=value, colour=colour))
+            value = factor * sigma / size
+            predicted.append(page.Series(label=f"{words} by the filter", value=value, colour=colour, dash=True))
         title = f"|{name} error|: quantiles of the runs, and those predicted by the filter"
         courses = [*quantiles, *predicted]
         least, largest = (each([each(line.value) for line in courses]) for each in (np.min, np.max))

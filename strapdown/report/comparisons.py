@@ -46,15 +46,11 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     charts = _angles(time, (attitude, other), names, a.fixed_frame)
     charts += _differences("Attitude", time, difference, (sigma[:, :3], other_sigma[:, :3]), names, angle_unit)
     if a.has_bias and b.has_bias:
-        charts += _differences(
-            "Gyro bias", time, other_bias - bias, (sigma[:, 3:], other_sigma[:, 3:]), names, rate_unit
-        )
-        statistics["bias_difference_rms_by_axis_rad_per_s"] = np.sqrt(
-            np.mean((other_bias - bias) ** 2, axis=0)
-        ).tolist()
-    truth = a.truth
-    if truth is not None:
-        charts += _errors(time, truth.attitude[inside], (attitude, other), names)
+        change = other_bias - bias
+        charts += _differences("Gyro bias", time, change, (sigma[:, 3:], other_sigma[:, 3:]), names, rate_unit)
+        statistics["bias_difference_rms_by_axis_rad_per_s"] = np.sqrt(np.mean(change**2, axis=0)).tolist()
+    if a.truth is not None:
+        charts += _errors(time, a.truth.attitude[inside], (attitude, other), names)
     frames = [estimate.fixed_frame or "the scenario's" for estimate in (a, b)]
     differ = f"; fixed frames: {' and '.join(frames)}" if frames[0] != frames[1] else ""
     content = page.page(
@@ -76,19 +72,14 @@ def _at(estimate: Estimate, time: Array) -> tuple[Array, Array, Array]:
 
 
 def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str], fixed_frame: str) -> list[str]:
-    euler = [roll_pitch_yaw(q) for q in attitudes]
-    return [
-        page.chart(
-            label,
-            "angle, °",
-            time,
-            [
-                page.Series(label=name, value=angles[:, k], colour=page.COLOURS[j], wraps=True, dash=j == 1)
-                for j, (name, angles) in enumerate(zip(names, euler, strict=True))
-            ],
-        )
-        for k, label in enumerate(angle_labels(fixed_frame))
-    ]
+    charts = []
+    for label, *pair in zip(angle_labels(fixed_frame), *(roll_pitch_yaw(q).T for q in attitudes), strict=True):
+        series = [
+            page.Series(label=name, value=angle, colour=page.COLOURS[j], wraps=True, dash=j == 1)
+            for j, (name, angle) in enumerate(zip(names, pair, strict=True))
+        ]
+        charts.append(page.chart(label, "angle, °", time, series))
+    return charts
 
 
 def _differences(
@@ -116,13 +107,11 @@ def _differences(
 
 def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tuple[str, str]) -> list[str]:
     known = np.isfinite(truth).all(axis=1)  # a reference may have gaps
-    errors = [np.full(len(truth), np.nan) for _ in attitudes]
-    for error, attitude in zip(errors, attitudes, strict=True):
+    series = []
+    for j, (name, attitude) in enumerate(zip(names, attitudes, strict=True)):
+        error = np.full(len(truth), np.nan)
         error[known] = quaternion.angle_between(attitude[known], truth[known]) / DEGREE
-    series = [
-        page.Series(label=name, value=error, colour=page.COLOURS[j], dash=j == 1)
-        for j, (name, error) in enumerate(zip(names, errors, strict=True))
-    ]
+        series.append(page.Series(label=name, value=error, colour=page.COLOURS[j], dash=j == 1))
     return [page.chart("Total attitude error relative to the truth", "error, °", time, series)]
 
 

@@ -96,9 +96,8 @@ def _estimate_charts(estimate: Estimate) -> list[str]:
     charts = [page.chart("Attitude, Euler angles Z-Y-X", "angle, °", time, series)]
     if estimate.has_bias:
         unit, size = rate_unit(3.0 * sigma[len(time) // 20 :, 3:])
-        series = [
-            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=page.COLOURS[k]) for k in range(3)
-        ]
+        values = zip(AXES, estimate.bias.T / size, page.COLOURS, strict=True)
+        series = [page.Series(label=axis, value=bias, colour=colour) for axis, bias, colour in values]
         charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", time, series))
     if estimate.has_covariance:
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
@@ -108,10 +107,9 @@ def _estimate_charts(estimate: Estimate) -> list[str]:
 
 
 def _sensor(name: str, innovations: Innovations) -> str:
-    if len(innovations.time) < 8:
-        return page.section(
-            f"Innovations of {name}", page.paragraph(f"{len(innovations.time)} measurements are too few to draw.")
-        )
+    title, number = f"Innovations of {name}", len(innovations.time)
+    if number < 8:
+        return page.section(title, page.paragraph(f"{number} measurements are too few to draw."))
     white = innovations.whitened
 
     def draw() -> Figure:
@@ -121,8 +119,9 @@ def _sensor(name: str, innovations: Innovations) -> str:
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[2])
         return figure
 
-    caption = f"Innovations of {name} divided by their σ: distribution, autocorrelation, NIS over time"
-    return page.section(f"Innovations of {name}", page.figure(draw, caption))
+    return page.section(
+        title, page.figure(draw, f"{title} divided by their σ: distribution, autocorrelation, NIS over time")
+    )
 
 
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
