@@ -141,7 +141,7 @@ def score(recording: Recording, run: Filter) -> Score:
     P = np.full((len(q), 3, 3), np.nan) if covariance is None else covariance[judged]
     turned = quaternion.multiply(quaternion.exp([0.0, 0.0, -offset]), q)
     estimate = Estimate.from_arrays(recording.time[judged], turned, P)
-    sizes = sd.accuracy(estimate, Truth.of_reference(reference)).given["all samples"]
+    sizes = sd.accuracy(estimate, Truth(attitude=reference)).given["all samples"]
     errors, held = ([size[k] for size in sizes.values()] for k in (0, 3))
     error_deg = tuple(np.degrees(errors).tolist())
     if covariance is None:

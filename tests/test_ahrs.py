@@ -1069,9 +1069,9 @@ def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     moving = hand_held.modified(whole)["no rest"]
     result = ahrs.estimate(moving, latency=0.0, full_covariance=True)
     assert np.sqrt(result.initial.covariance[0, 0]) > 6.0 * DEGREE
-    total = consistency.accuracy.accuracy(result.estimate, Truth.of_reference(moving.true_attitude)).given[
-        "all samples"
-    ]["total"]
+    total = consistency.accuracy.accuracy(result.estimate, Truth(attitude=moving.true_attitude)).given["all samples"][
+        "total"
+    ]
     assert total.coverage > 0.9
     assert total.rms < 15.0 * DEGREE
 
