@@ -142,11 +142,12 @@ def score(recording: Recording, run: Filter) -> Score:
     turned = quaternion.multiply(quaternion.exp([0.0, 0.0, -offset]), q)
     estimate = Estimate.from_arrays(recording.time[judged], turned, P)
     sizes = sd.accuracy(estimate, Truth(attitude=reference)).given["all samples"]
-    errors, held = ([size[k] for size in sizes.values()] for k in (0, 3))
-    error_deg = tuple(np.degrees(errors).tolist())
+    error_deg = tuple(np.degrees([size.rms for size in sizes.values()]).tolist())
     if covariance is None:
         return Score(error_deg, None, None, rows, us)
-    return Score(error_deg, tuple(held), sizes["total"].rms_over_sigma ** 2, rows, us)
+    return Score(
+        error_deg, tuple(size.coverage for size in sizes.values()), sizes["total"].rms_over_sigma ** 2, rows, us
+    )
 
 
 def read(folder: Path) -> list[Recording]:
