@@ -125,7 +125,7 @@ def draw(record: ImuRecord, estimate: Estimate, result: Result, place: Path) -> 
     top.fill_between(time, -3.0 * sigma, 3.0 * sigma, color="0.85", label="±3σ")
     looks = (("Python", "-", estimate.attitude[1:]), ("C, double", "--", result.attitudes["double"]))
     for label, line, attitude in looks:
-        error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), record.truth.attitude[1:]))
+        error = quaternion.rotation_between(attitude, record.truth.attitude[1:])
         top.plot(time, error[:, 2] / DEGREE, line, label=label)
     bound = 4.5 * sigma[len(time) // 20 :].max()
     top.set(ylabel="attitude error z, °", ylim=(-bound, bound))

@@ -170,7 +170,7 @@ def run_peer(name: str, recording: Recording, gain: float) -> tuple[Array, float
 
 def late_errors(attitude: Array, truth: Array) -> Array:
     """Return the attitude errors over the second half (m, 3), rad."""
-    error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), truth))
+    error = quaternion.rotation_between(attitude, truth)
     return np.asarray(error[len(error) // 2 :])
 
 

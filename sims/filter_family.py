@@ -141,7 +141,7 @@ def half_noise(noise: ProcessNoise, dt: float) -> Array:
 def rows_of(series: VectorMeasurements, k: int, q: Array, midway: bool) -> tuple[Array, Array, Array]:
     """Return H (d, 3), innovation (d,) and noise (d, d) of a measurement; ``midway``: with the equivariant rows."""
     if series.attitude is not None:
-        y = quaternion.log(quaternion.multiply(quaternion.conjugate(q), series.attitude[k]))
+        y = quaternion.rotation_between(q, series.attitude[k])
         return np.eye(3), y, series.covariances[k]
     r, z = series.references_f[k], series.vector_b[k]
     predicted = quaternion.rotate(quaternion.conjugate(q), r)

@@ -114,7 +114,7 @@ def gyro_latency(recording: Recording) -> float:
         centre = centre[recording.movement[centre]]
     centre = centre[(centre > 10) & (centre < len(time) - 10)]
     q = recording.true_attitude
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[centre - reach]), q[centre + reach]))
+    turn = quaternion.rotation_between(q[centre - reach], q[centre + reach])
     wanted = turn / (time[centre + reach] - time[centre - reach])[:, None]
     whole = CubicSpline(time, np.vstack([np.zeros(3), np.cumsum(recordings.increments(recording), axis=0)]))
 

@@ -223,7 +223,7 @@ class Gtsam:
                 H = np.hstack([zero, zero, R])
                 ekf.updateWithVector(ekf.state().velocity(), H, data.velocity[k], VELOCITY**2 * eye)
                 now = quaternion.from_matrix(ekf.state().attitude().matrix())
-                turn = quaternion.log(quaternion.multiply(quaternion.conjugate(now), data.attitude[j]))
+                turn = quaternion.rotation_between(now, data.attitude[j])
                 ekf.updateWithVector(np.zeros(3), np.hstack([eye, zero, zero]), turn, HEADING**2 * eye)
             q[k], P[k] = quaternion.from_matrix(ekf.state().attitude().matrix()), ekf.covariance()[:3, :3]
         return Estimate.from_arrays(record.time[:-1], q, P)

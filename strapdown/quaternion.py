@@ -31,6 +31,7 @@ __all__ = [
     "multiply",
     "normalize",
     "rotate",
+    "rotation_between",
     "to_matrix",
     "to_rotation",
 ]
@@ -342,6 +343,27 @@ def from_rotation(rotation: Rotation) -> Array:
     return np.roll(np.asarray(rotation.as_quat(), dtype=np.float64), 1, axis=-1)
 
 
+def rotation_between(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the rotation vector of the rotation that takes attitude p to attitude q, in body axes: log(p* ⊗ q).
+
+    Parameters
+    ----------
+    p, q : array_like (..., 4)
+        Unit quaternions; their leading axes broadcast.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        Rotation vector, rad, at most π long; also accurate for small angles.
+
+    Examples
+    --------
+    >>> rotation_between(IDENTITY, exp([0.0, 0.0, 0.5]))
+    array([0. , 0. , 0.5])
+    """
+    return log(multiply(conjugate(p), q))
+
+
 def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     """Return the angle of the rotation that takes attitude p to attitude q.
 
@@ -360,6 +382,4 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     >>> float(angle_between(IDENTITY, exp([0.0, 0.0, 1e-9])).round(15))
     1e-09
     """
-    return np.asarray(
-        np.linalg.norm(log(multiply(conjugate(unit_quaternions("p", p)), unit_quaternions("q", q))), axis=-1)
-    )
+    return np.asarray(np.linalg.norm(rotation_between(unit_quaternions("p", p), unit_quaternions("q", q)), axis=-1))

@@ -159,6 +159,12 @@ def test_zero_rotation():
     np.testing.assert_array_equal(quaternion.log(-quaternion.IDENTITY), np.zeros(3))
 
 
+def test_rotation_between(rotation_vectors):
+    p, q = (Rotation.from_rotvec(rotation_vectors(80, 1e-12, 3.1)[::step]) for step in (1, -1))
+    between = quaternion.rotation_between(quaternion.from_rotation(p), quaternion.from_rotation(q))
+    np.testing.assert_allclose(Rotation.from_rotvec(between).as_matrix(), (p.inv() * q).as_matrix(), atol=4 * EPS)
+
+
 def test_angle_between(rotation_vectors):
     phi = rotation_vectors(80, 1e-12, 3.1)
     p = random_quaternions((80,))

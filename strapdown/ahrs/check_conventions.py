@@ -575,7 +575,7 @@ def _with_reference(recording: Recording, sensors: _Sensors, step: int) -> _Expl
         q = true[rows] / lengths(true[rows])[:, None]
         return np.stack([q, *(read(q) for read in ATTITUDE_READINGS.values())])
 
-    reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))
+    reference = quaternion.rotation_between(at(first), at(last))
     if np.sum(lengths(reference[0])) < MIN_TURN:
         return None
     parts = {"gyro": np.repeat(_gyro_fits(turn, reference), len(FRAMES), axis=0)}

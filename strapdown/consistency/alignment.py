@@ -125,7 +125,7 @@ def in_truth_frames(attitude: Array, alignment: Alignment) -> Array:
 
 def turns(first: Array, other: Array) -> Array:
     """Return the rotation vectors (m, 3), rad, body axes, from attitudes (m, 4) to others."""
-    return quaternion.log(quaternion.multiply(quaternion.conjugate(first), other))
+    return quaternion.rotation_between(first, other)
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:

@@ -142,7 +142,7 @@ def trajectory_of(scenario: Scenario, setup: FilterSetup, epochs: int) -> Trajec
     times = np.concatenate([np.empty(0), *(series.time for series in own)])
     stamps = np.union1d(edges, times[(times >= edges[0]) & (times <= edges[-1])])
     attitude = scenario.motion.attitude(stamps)
-    phi = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))
+    phi = quaternion.rotation_between(attitude[:-1], attitude[1:])
     record = with_sigma(ImuRecord(time=stamps, increments=phi, vectors=tuple(own)), setup)
     for series in record.vectors:
         if not np.all(series.sigma > 0.0):

@@ -261,7 +261,7 @@ def mixture(bank: list[Estimate], rows: np.ndarray, weights: Array) -> tuple[Arr
     attitudes, biases = (np.array([getattr(each, name)[rows] for each in bank]) for name in ("attitude", "bias"))
     mean = attitudes[np.argmax(weights, axis=0), np.arange(len(rows))]
     for _ in range(20):
-        away = quaternion.log(quaternion.multiply(quaternion.conjugate(mean), attitudes))
+        away = quaternion.rotation_between(mean, attitudes)
         shift = np.einsum("hr,hri->ri", weights, away)
         mean = quaternion.normalize(quaternion.multiply(mean, quaternion.exp(shift)))
         if np.abs(shift).max() < 1e-12:

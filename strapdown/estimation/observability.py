@@ -189,7 +189,7 @@ def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
     A filter started on it stays on it, whatever its noise model, so its covariance is linearised along one trajectory. Linearised along an
     estimate that changes with each measurement, it would have spurious information about unobservable directions.
     """
-    turns = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))
+    turns = quaternion.rotation_between(attitude[:-1], attitude[1:])
     series = []
     for whole in record.vectors:
         s = whole.taken((whole.time >= record.time[0]) & (whole.time <= record.time[-1]))

@@ -503,7 +503,7 @@ def _total(lanes: Array) -> Array:
 
 def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
     """Return error and σ (m, 6) from the stored values of one run (m, KEPT)."""
-    error = quaternion.log(quaternion.multiply(quaternion.conjugate(kept[:, :4]), truth))
+    error = quaternion.rotation_between(kept[:, :4], truth)
     diagonal = kept[:, [7, 10, 12, 22, 25, 27]]
     return np.concatenate([error, kept[:, 28:31] - kept[:, 4:7]], axis=1), np.sqrt(diagonal)
 

@@ -316,7 +316,7 @@ def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED)
     share = (time - stamps[k]) / width
     usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
     k, share = k[usable], share[usable]
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
+    turn = quaternion.rotation_between(q[k], q[k + 1])
     result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
     return result
 

@@ -33,7 +33,7 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     time = a.time[inside]
     attitude, sigma, bias = a.attitude[inside], a.sigma[inside], a.bias[inside]
     other, other_sigma, other_bias = _at(b, time)
-    difference = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), other))
+    difference = quaternion.rotation_between(attitude, other)
     angle = np.linalg.norm(difference, axis=1)
     statistics = {
         "sources": list(names),

@@ -43,7 +43,7 @@ class Comparison(Listed):
         late = first.time >= 0.5 * (first.time[0] + first.time[-1])
         result = {}
         for name, estimate in self.estimates.items():
-            turn = quaternion.log(quaternion.multiply(quaternion.conjugate(estimate.attitude), attitude))
+            turn = quaternion.rotation_between(estimate.attitude, attitude)
             total, degrees = _nis(estimate, float(first.time[late][0]))
             result[name] = {
                 "attitude_error": _root_mean_square(turn[late]),

@@ -185,7 +185,7 @@ def commutes_badly(record: ImuRecord, white: float) -> bool:
     one_sample = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
     other = coning.integrate(record.increments, better, edges=record.time)[-1]
     length = float(record.time[-1] - record.time[0])
-    drift = float(np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(one_sample), other)))) / length
+    drift = float(np.linalg.norm(quaternion.rotation_between(one_sample, other))) / length
     return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
 
 

@@ -122,7 +122,7 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
     for k in range(1, n):
         turn = quaternion.multiply(turn, best[:, k])
     step = np.diff(record.time[: blocks * n + 1 : n])
-    drift = quaternion.log(quaternion.multiply(quaternion.conjugate(turn), own))
+    drift = quaternion.rotation_between(turn, own)
     # Steps of one vibration are correlated, so the scatter is that between blocks much longer than its period.
     parts = min(20, blocks)
     bounds = np.linspace(0, blocks, parts + 1).astype(int)
