@@ -36,36 +36,6 @@ MAX_DIP = np.radians(80.0)
 """Maximum dip for which the noise of the heading is computed, rad."""
 
 
-class FieldSteps(NamedTuple):
-    """Samples averaged over the filter's steps, in the frame fixed by the integrated gyro."""
-
-    field: Array
-    """Field (k, 3)."""
-    frame: Array
-    """Attitude by the gyro in the middle of each step (k, 4)."""
-    length: Array
-    """Duration that the field's samples of each step cover, s; 0: none (k,)."""
-    force: Array
-    """Specific force (k, 3); without samples that of the step before."""
-    end: Array
-    """Attitude by the gyro at the end of each step (k, 4)."""
-    time: Array
-    """Time of the steps' edges, s (k + 1,)."""
-    turn_variance: Array
-    """Variance of the rotation by the gyro over each step in addition to its noise, rad² (k,)."""
-
-    def without_drift(self, bias: Array, interval: float) -> FieldSteps:
-        """Return the samples without the rotation of that frame by the gyro's bias (k, 3), rad/s; ``interval``: that of the steps, s."""
-        drift, out = np.array([1.0, 0.0, 0.0, 0.0]), np.empty_like(self.frame)
-        compiled(kernel.drifts)(interval, read_only(bias), read_only(self.frame), drift, out)
-        return self._replace(
-            field=quaternion.rotate(out, self.field),
-            force=quaternion.rotate(out, self.force),
-            frame=quaternion.multiply(out, self.frame),
-            end=quaternion.multiply(out, self.end),
-        )
-
-
 class Headings(NamedTuple):
     """Heading measurements, and what was found of the field."""
 
@@ -129,17 +99,19 @@ def first_variance(force: Array, field: Array, parameters: AhrsParameters) -> fl
     return float(iron_variance(parameters.first_iron_sigma, sine_of_dip(force.tolist(), field.tolist())))
 
 
-def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
-    """Return the heading measurements, each from all steps."""
-    known = steps.length > 0.0
-    interval = float(np.median(np.diff(steps.time)))
-    field = held(steps.field, known)
-    vertical = _vertical(steps.force, interval)
+def smoothed(steps: kernel.Steps, start: float, parameters: AhrsParameters, interval: float) -> Headings:
+    """Return the heading measurements, each from all steps; the first sample is at ``start``, s."""
+    if steps.bias.any():
+        steps = _without_drift(steps, interval)
+    known, shown = steps.number > 0.0, steps.force_number > 0.0
+    interval = float(np.median(np.diff(steps.time, prepend=start)))
+    field = _held(steps.field / np.maximum(steps.number, 1.0)[:, None], known)
+    vertical = _vertical(_held(steps.force / np.maximum(steps.force_number, 1.0)[:, None], shown), interval)
     as_measured = _look(field, vertical, parameters, interval)
     measured = as_measured
     usual = float(measured.usual[0, 0])
     iron, unshown = hard_iron.find(
-        field, vertical, steps.frame, known, steps.time[1:], usual, parameters.unshown_iron_sigma
+        field, vertical, steps.frame, known, steps.time, usual, parameters.unshown_iron_sigma
     )
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
@@ -158,7 +130,7 @@ def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
         1.0 + measured.deviation / parameters.field_deviation**2
     )
     direction = np.where(known[:, None], field / measured.strength[:, None], 0.0)
-    vectors = _gathered(steps, direction, steps.length / noise, parameters.heading_interval)
+    vectors = _gathered(steps, start, direction, steps.length / noise, parameters.heading_interval)
     variance = (parameters.iron_sigma**2 + unshown) / np.cos(measured.usual[:, 1]) ** 2
     return Headings(vectors, measured.usual, iron, variance)
 
@@ -184,10 +156,23 @@ def _look(field: Array, vertical: Array, parameters: AhrsParameters, interval: f
     return _Look(level[:, 0], usual, low_pass(square[:, None], interval / parameters.field_memory)[:, 0])
 
 
-def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_interval: float) -> VectorMeasurements:
+def _without_drift(steps: kernel.Steps, interval: float) -> kernel.Steps:
+    """Return the samples in a frame that does not rotate with the gyro's bias; ``interval``: that of the steps, s."""
+    drift, out = np.array([1.0, 0.0, 0.0, 0.0]), np.empty_like(steps.frame)
+    compiled(kernel.drifts)(interval, read_only(steps.bias), read_only(steps.frame), drift, out)
+    return steps._replace(
+        field=quaternion.rotate(out, steps.field),
+        force=quaternion.rotate(out, steps.force),
+        frame=quaternion.multiply(out, steps.frame),
+        end=quaternion.multiply(out, steps.end),
+    )
+
+
+def _gathered(
+    steps: kernel.Steps, start: float, direction: Array, information: Array, heading_interval: float
+) -> VectorMeasurements:
     """Return heading measurements: directions (k, 3) averaged over the heading interval, weighted by their information (k,)."""
-    time = steps.time
-    edge = np.flatnonzero(np.diff(np.floor((time[1:] - time[0]) / heading_interval - 1e-6), append=np.inf))
+    edge = np.flatnonzero(np.diff(np.floor((steps.time - start) / heading_interval - 1e-6), append=np.inf))
     begin = np.append(0, edge[:-1] + 1)
     for k in np.flatnonzero(steps.turn_variance * information):  # directions before it are as uncertain
         before, variance = slice(begin[np.searchsorted(begin, k, side="right") - 1], k), steps.turn_variance[k]
@@ -200,7 +185,7 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
     return VectorMeasurements(
         sensor="magnetometer",
         kind="heading",
-        time=time[1:][edge][informed],
+        time=steps.time[edge][informed],
         vector_b=quaternion.rotate(quaternion.conjugate(steps.end[edge][informed]), total),
         reference_f=NORTH,
         sigma=1.0 / np.sqrt(information[informed]),
@@ -223,7 +208,7 @@ def _strength_and_dip(field: Array, vertical: Array) -> Array:
     )
 
 
-def held(values: Array, known: np.ndarray) -> Array:
+def _held(values: Array, known: np.ndarray) -> Array:
     """Return rows (k, …) with each unknown row replaced by the last known one before it, or by the first known one."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])

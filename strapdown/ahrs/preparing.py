@@ -64,7 +64,7 @@ def prepare(
         turned = sensor_delays.gyro_attitude(recording)
     initial = starting.start(recording, turned, parameters)  # first, because it rejects a sensor without samples
     interval = recording.interval
-    edge, step = edges(recording.time, parameters.step, interval), max(parameters.step, interval)
+    edge = edges(recording.time, parameters.step, interval)
     time = recording.time[edge]
     assert recording.specific_force is not None
     total, number = sums(recording.specific_force, turned, edge)
@@ -85,42 +85,34 @@ def prepare(
     skipped = {"accelerometer": missing(recording.specific_force, number)}
     heading = None
     if recording.magnetic_field is not None:
-        frame = turned
-        if np.any(field_delay):
-            frame = np.empty_like(turned)
-            over = sensor_delays.turn_over(recording, field_delay)
-            compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        field, counted = sums(recording.magnetic_field, frame, edge)
-        skipped["magnetometer"] = missing(recording.magnetic_field, counted)
-        middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         variance = added.max(axis=1)
         variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
-        if causal:
-            before = np.searchsorted(at_rest.last, edge[1:])
-            bias = np.concatenate([np.zeros((1, 3)), at_rest.bias])[before]
-            rows = kernel.Steps(
-                field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance, bias
-            )
-            heading = headings.online(rows, float(time[0]), parameters, step)
-        else:
-            samples = headings.FieldSteps(
-                field=field / np.maximum(counted, 1.0)[:, None],
-                frame=middle,
-                length=counted * interval,
-                force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
-                end=turned[edge[1:]],
-                time=time,
-                turn_variance=variance,
-            )
-            if len(at_rest.last):
-                columns = [np.interp(time[1:], recording.time[at_rest.last], axis) for axis in at_rest.bias.T]
-                samples = samples.without_drift(np.stack(columns, axis=-1), step)
-            heading = headings.smoothed(samples, parameters)
+        field, counted, middle = field_sums(recording, field_delay, turned, edge)
+        bias = starting.bias_by_rests(at_rest, recording.time, edge, causal=causal)
+        steps = kernel.Steps(
+            field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance, bias
+        )
+        skipped["magnetometer"] = missing(recording.magnetic_field, counted)
+        headings_by = headings.online if causal else headings.smoothed
+        heading = headings_by(steps, float(time[0]), parameters, max(parameters.step, interval))
         vectors.append(heading.vectors)
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
     return Prepared(record, initial, edge, turned, added, skipped, heading)
+
+
+def field_sums(
+    recording: Recording, delay: Array | float, turned: Array, edge: np.ndarray
+) -> tuple[Array, Array, Array]:
+    """Return :func:`sums` of the field, whose samples have a delay, s, and the attitude by the gyro in the middle of each step (k, 4)."""
+    frame = turned
+    if np.any(delay):
+        frame = np.empty_like(turned)
+        over = sensor_delays.turn_over(recording, delay)
+        compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
+    assert recording.magnetic_field is not None
+    return *sums(recording.magnetic_field, frame, edge), frame[(edge[:-1] + edge[1:] + 1) // 2]
 
 
 def without_temperature(

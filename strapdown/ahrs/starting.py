@@ -295,6 +295,18 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
     return parameters
 
 
+def bias_by_rests(at_rest: Rests, time: Array, edge: np.ndarray, *, causal: bool) -> Array:
+    """Return the gyro's bias that the rests before each step show, or all rests (k, 3), rad/s; zero without one.
+
+    ``time`` (n,): of the samples, s; ``edge`` (k + 1,): the steps' first and last samples.
+    """
+    if len(at_rest.last) == 0:
+        return np.zeros((len(edge) - 1, 3))
+    if causal:
+        return np.asarray(np.concatenate([np.zeros((1, 3)), at_rest.bias])[np.searchsorted(at_rest.last, edge[1:])])
+    return np.stack([np.interp(time[edge[1:]], time[at_rest.last], axis) for axis in at_rest.bias.T], axis=-1)
+
+
 def drift_by_rests(at_rest: Rests, time: Array) -> Array:
     """Return the change of the gyro's bias since the first rest, rad/s, at every sample (n, 3), by all spans at rest.
 
