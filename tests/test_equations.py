@@ -9,9 +9,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.linalg import solve_continuous_are
 
-from strapdown import allan, coning, gyro, kinematics
+from strapdown import allan, coning, kinematics
 from strapdown.motion import orbit
 from strapdown.vectors import wahba
 
@@ -26,18 +25,6 @@ def test_the_bortz_equation_as_bortz_wrote_it(angle, axis):
         factor = float((1 - size * mp.sin(size) / (2 * (1 - mp.cos(size)))) / size**2)
     expected = w + 0.5 * np.cross(phi, w) + factor * np.cross(phi, np.cross(phi, w))
     assert_allclose(np.linalg.inv(kinematics.right_jacobian(phi)) @ w, expected, rtol=1e-14)
-
-
-@pytest.mark.parametrize(("white", "walk", "density"), [(0.1, 0.2, 1.0), (1e-3, 0.5, 1e-2), (2.0, 1e-3, 7.0)])
-def test_the_steady_variance_of_frequent_measurements(white, walk, density):
-    """√r √(σ_v² + 2 σ_u √r), of ``gyro.best_bandwidth`` (Farrenkopf 1978), by the algebraic Riccati equation."""
-    root = math.sqrt(density)
-    dynamics = np.array([[0.0, -1.0], [0.0, 0.0]])  # the error of the angle, driven by that of the bias
-    P = solve_continuous_are(dynamics.T, np.array([[1.0], [0.0]]), np.diag([white**2, walk**2]), np.array([[density]]))
-    assert P[0, 0] == pytest.approx(root * math.sqrt(white**2 + 2.0 * walk * root), rel=1e-9)
-    # The natural frequency of that filter, s² + (P₁₁/r) s − P₁₂/r, is where r ω⁴ = σ_u²: no flicker, no bound.
-    spec = gyro.GyroSpec(angle_random_walk=white, rate_random_walk=walk)
-    assert gyro.best_bandwidth(spec, density) == pytest.approx(math.sqrt(-P[0, 1] / density), rel=1e-9)
 
 
 def test_the_floor_of_bias_instability():

@@ -130,9 +130,11 @@ def smoothed(steps: kernel.Steps, start: float, parameters: AhrsParameters, inte
         1.0 + measured.deviation / parameters.field_deviation**2
     )
     direction = np.where(known[:, None], field / measured.strength[:, None], 0.0)
-    vectors = _gathered(steps, start, direction, steps.length / noise, parameters.heading_interval)
-    variance = (parameters.iron_sigma**2 + unshown) / np.cos(measured.usual[:, 1]) ** 2
-    return Headings(vectors, measured.usual, iron, variance)
+    up = quaternion.rotate(quaternion.conjugate(steps.frame), vertical)
+    variance = np.einsum("ki,ki->k", up**2, steps.turn_variance)  # of the rotation about the vertical
+    vectors = _gathered(steps, start, direction, steps.length / noise, variance, parameters.heading_interval)
+    by_iron = (parameters.iron_sigma**2 + unshown) / np.cos(measured.usual[:, 1]) ** 2
+    return Headings(vectors, measured.usual, iron, by_iron)
 
 
 class _Look(NamedTuple):
@@ -169,15 +171,18 @@ def _without_drift(steps: kernel.Steps, interval: float) -> kernel.Steps:
 
 
 def _gathered(
-    steps: kernel.Steps, start: float, direction: Array, information: Array, heading_interval: float
+    steps: kernel.Steps, start: float, direction: Array, information: Array, variance: Array, heading_interval: float
 ) -> VectorMeasurements:
-    """Return heading measurements: directions (k, 3) averaged over the heading interval, weighted by their information (k,)."""
+    """Return heading measurements: directions (k, 3) averaged over the heading interval, weighted by their information (k,).
+
+    ``variance`` (k,): of the rotation about the vertical over each step, in addition to the gyro's noise, rad².
+    """
     edge = np.flatnonzero(np.diff(np.floor((steps.time - start) / heading_interval - 1e-6), append=np.inf))
     begin = np.append(0, edge[:-1] + 1)
-    for k in np.flatnonzero(steps.turn_variance * information):  # directions before it are as uncertain
-        before, variance = slice(begin[np.searchsorted(begin, k, side="right") - 1], k), steps.turn_variance[k]
-        information[before] /= 1.0 + variance * information[before].sum()
-        information[k] /= 1.0 + variance * information[k]
+    for k in np.flatnonzero(variance * information):  # directions before it are as uncertain
+        before = slice(begin[np.searchsorted(begin, k, side="right") - 1], k)
+        information[before] /= 1.0 + variance[k] * information[before].sum()
+        information[k] /= 1.0 + variance[k] * information[k]
     total = np.add.reduceat(direction * information[:, None], begin, axis=0)
     information = np.add.reduceat(information, begin)
     informed = information > 0.0

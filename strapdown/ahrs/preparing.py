@@ -85,8 +85,8 @@ def prepare(
     skipped = {"accelerometer": missing(recording.specific_force, number)}
     heading = None
     if recording.magnetic_field is not None:
-        variance = added.max(axis=1)
-        variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
+        variance = added.copy()
+        variance[1:] += added[:-1]  # most of a step's samples may precede the uncertain rotation
         field, counted, middle = field_sums(recording, field_delay, turned, edge)
         bias = starting.bias_by_rests(at_rest, recording.time, edge, causal=causal)
         steps = kernel.Steps(

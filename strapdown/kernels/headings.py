@@ -83,7 +83,7 @@ class Steps(NamedTuple):
     time: np.ndarray
     """Time of the end, s (k,)."""
     turn_variance: np.ndarray
-    """Largest variance of the rotation by the gyro about an axis over the step in addition to its noise, rad²: gaps, clipping (k,)."""
+    """Variance of the rotation by the gyro about each body axis over the step in addition to its noise, rad²: gaps, clipping (k, 3)."""
     bias: np.ndarray
     """Bias of the gyro by the rests before (k, 3), rad/s; 0: no rest yet."""
 
@@ -239,8 +239,10 @@ def look_at_field(constants, steps, memory, out, k, known, drift):
     field = vector_at(memory.held, 0)
     frame = quaternion_multiply(drift, quaternion_at(steps.frame, k))
     # After an uncertain rotation, directions before it are as uncertain in the frame fixed by the gyro: they are forgotten.
-    variance = steps.turn_variance[k]
-    forgotten = variance / (variance + constants.field_deviation * constants.field_deviation)
+    turn = vector_at(steps.turn_variance, k)
+    largest = max(turn[0], turn[1])
+    largest = max(largest, turn[2])
+    forgotten = largest / (largest + constants.field_deviation * constants.field_deviation)
     if forgotten > 0.5:
         memory.counted[2] = 0
         for i in range(len(memory.ring)):
@@ -278,6 +280,8 @@ def look_at_field(constants, steps, memory, out, k, known, drift):
         noise = (
             relative * relative * (1.0 + memory.deviation[2] / (constants.field_deviation * constants.field_deviation))
         )
+        u = transpose_times_vector(R, up)
+        variance = u[0] * u[0] * turn[0] + u[1] * u[1] * turn[1] + u[2] * u[2] * turn[2]  # about the vertical
         information = 1.0 / (noise / steps.length[k] + variance)  # the step's samples may precede that rotation too
         remaining = 1.0 / (1.0 + variance * memory.total[3])
         for i in range(3):

@@ -68,7 +68,7 @@ PASSING = {
     "middle": ((1, 4), "", "attitude by the gyro in the middle of the step"),
     "end": ((1, 4), "", "and at its end"),
     "now": ((1,), "wide", "time of its end, s"),
-    "turn_variance": ((1,), "", "0: the rotation over the step is as certain as ever"),
+    "turn_variance": ((1, 3), "", "0: the rotation over the step is as certain as ever"),
     "found_direction": ((1, 3), "", "heading measurement at the end of the step"),
     "found_sigma": ((1,), "", "its sigma; 0: none"),
     "found_usual": ((1, 2), "", "usual magnitude and dip of the field"),
@@ -277,7 +277,8 @@ def end_field(imu):
         a.middle[0, i], a.end[0, i] = a.frame[middle, i], a.turned[i]
     a.length[0] = a.field_number[0] * imu.interval
     a.now[0] = a.clock[0]
-    a.turn_variance[0] = 0.0
+    for i in range(3):
+        a.turn_variance[0, i] = 0.0
     call(routines.head.address, routines.head.arguments, ())
     if a.found_sigma[0] > 0.0:
         update_filter(imu, 1, a.found_direction, a.found_sigma[0], a.field_innovation)
