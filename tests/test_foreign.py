@@ -149,6 +149,16 @@ def test_a_rotation_of_two_sigma_is_a_likely_cause():
     assert len(replace(outcome, explanations=()).tables) == 1
 
 
+def test_a_bias_held_at_zero_is_named(replayed):
+    sigma = np.sqrt(np.mean(np.trace(replayed.estimate.covariance[:, 3:, 3:], axis1=1, axis2=2)))
+    for factor, likely in ((2.9, False), (3.1, True)):
+        bias = np.full((len(replayed.estimate.time), 3), factor * sigma / np.sqrt(3.0))
+        outcome = checked(replayed, bias=np.zeros_like(bias), true_bias=bias, innovations={})
+        (named,) = (explanation for explanation in outcome.explanations if explanation.name == "gyro bias held at zero")
+        assert named.likely == likely
+        assert named.value == f"{factor * sigma / DEGREE * 3600.0:.3g} °/h"
+
+
 @pytest.fixture
 def command(run):
     """``strapdown ARGUMENTS``: exit status, output and error, each in one line."""

@@ -36,7 +36,7 @@ from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_
 from strapdown.records import Estimate, Innovations, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
-from strapdown.units import DEGREE
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 if TYPE_CHECKING:
     from strapdown.recordings.attitudes import Attitudes
@@ -47,6 +47,7 @@ poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
 SCALE = "σ wrong by one factor"
+NO_BIAS = "gyro bias held at zero"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +214,8 @@ def check_attitudes(
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
         derivatives = jacobian(common.time, aligned, true)
-        explained = explanations(error, readings[frame], derivatives, confidence_level=confidence_level)
+        unestimated = true.bias if common.bias is not None and not common.bias.any() else None
+        explained = explanations(error, readings[frame], derivatives, unestimated, confidence_level=confidence_level)
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
     estimate = replace(estimate, truth=true, motion=own.motion)
@@ -312,14 +314,22 @@ def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) ->
 
 
 def explanations(
-    error: Array, covariance: Array, derivatives: Array, *, confidence_level: float = 0.99
+    error: Array,
+    covariance: Array,
+    derivatives: Array,
+    unestimated: Array | None = None,
+    *,
+    confidence_level: float = 0.99,
 ) -> tuple[Explanation, ...]:
     """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
-    ``derivatives`` (m, 3, 7) are those of :func:`jacobian`. For a consistent filter none is likely with ``confidence_level``.
+    ``derivatives`` (m, 3, 7) are those of :func:`jacobian`; ``unestimated`` (m, 3) is the gyro's bias if the filter holds it at zero. For
+    a consistent filter none is likely with ``confidence_level``.
     """
     P = covariance[:, :3, :3]
     candidates = [*_constant_differences(error, P, derivatives), _wrong_scale(whitened(error, P))]
+    if unestimated is not None:
+        candidates.append(_zero_bias(unestimated, covariance))
     likely = holm([candidate.p_value for candidate in candidates], 1.0 - confidence_level)
     marked = [replace(candidate, likely=is_likely) for candidate, is_likely in zip(candidates, likely, strict=True)]
     # Specific causes come before a factor on σ, which would absorb all of them.
@@ -355,6 +365,13 @@ def _wrong_scale(white: Array) -> Explanation:
     if average is not None and average.reliable:
         p_value = mean_p_value(average.mean, 3, average.effective, certainty=average.certainty)
     return Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value)
+
+
+def _zero_bias(bias: Array, P: Array) -> Explanation:
+    """Return a gyro bias that the filter holds at zero as a cause, likely if it exceeds three of its σ."""
+    rms, sigma = np.sqrt(3.0 * np.mean(bias**2)), np.sqrt(np.mean(np.trace(P[:, 3:, 3:], axis1=1, axis2=2)))
+    value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
+    return Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0)
 
 
 def _constant_p_value(total: Array, scores: Array) -> float:
