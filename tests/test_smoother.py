@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import tracemalloc
 
 import filterpy.common
 import filterpy.kalman
@@ -473,6 +474,19 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     off = np.max(np.abs(errors(part, rest.truth) / part.sigma), axis=1)
     assert np.max(off[: 120 - middle]) < 5.0
     assert part.events == whole.events
+
+
+def test_memory_does_not_grow_with_the_number_of_recoveries() -> None:
+    record, initial = simulated(dataclasses.replace(WELL_SEEN, duration=120.0), np.random.default_rng(1))
+    peaks = []
+    for edges in (range(600, 700, 600), range(1200, 5700, 600)):  # one turn, and eight more
+        for edge in edges:
+            record = with_a_turn(record, edge, quaternion.exp([0.0, 1.2, 0.7]))
+        tracemalloc.start()
+        assert len(recoveries(estimation.smooth(record, NOISE, initial, gate=GATE))) == edges[-1] // 600
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0]
 
 
 def nees_of_recoveries(runs: int) -> np.ndarray:

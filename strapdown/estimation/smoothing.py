@@ -163,37 +163,43 @@ def _estimate(problem: Problem, options: Options, kind: type[_SixStates | _ManyS
     )
 
 
-def _smoothed(
-    problem: Problem, options: Options, kind: type[_SixStates | _ManyStates], *, restarted: bool = False
-) -> tuple[Passed, list[Array]]:
-    """Return the filter's result over a record, and the smoothed states at its edges.
+def _smoothed(problem: Problem, options: Options, kind: type[_SixStates | _ManyStates]) -> tuple[Passed, list[Array]]:
+    """Return the filter's result over a record, and the smoothed states at its edges."""
+    time, last = problem.record.time, problem.record.time[-1]
+    whole = passed = filtered_whole(problem, options)
+    outputs = kind(problem).outputs(len(time), options)
+    begin = time[0]
 
-    ``restarted``: whether the record starts with a candidate. Another one that starts there counts from its recovery only.
-    """
-    time, form, state = problem.record.time, kind(problem), problem.initial
-    passed, outputs = filtered_whole(problem, options), form.outputs(len(time), options)
-    recoveries = [event for event in passed.estimate.events if event.kind == "recovery"]
-    if not recoveries:
-        form.go_back(passed.segments, segment_starts(problem, passed.segments), 0, outputs)
-        return passed, outputs
-    event = min(recoveries, key=lambda event: event.end)
-    memory = filtered(_part(problem, time[0], event.end, state), replace(options, every=len(time))).end.gate
-    assert memory is not None
-    since = max(memory.counts[SINCE], time[0])
-    if restarted and since == time[0]:
-        since = event.end
-    for begin, end in itertools.pairwise((time[0], max(event.start, time[0]), since, time[-1])):
-        if end > begin:
-            if begin == since:
-                state = _candidate(problem, options, state, memory, since)
-            part, rows = _smoothed(_part(problem, begin, end, state), options, kind, restarted=begin == since)
-            state = part.end
-            edges = np.flatnonzero((time >= begin) & ((time < end) | (time == time[-1]) & (end == time[-1])))
-            skip = int(begin not in time)
-            for out, row in zip(outputs, rows, strict=True):
-                if len(out):
-                    out[edges] = row[skip : skip + len(edges)]
-    return passed, outputs
+    def write(part: Problem, rows: Sequence[Array]) -> None:
+        first, end = part.record.time[[0, -1]]
+        edges = np.flatnonzero((time >= first) & ((time < end) | (time == last) & (end == last)))
+        skip = int(first not in time)
+        for out, row in zip(outputs, rows, strict=True):
+            if len(out):
+                out[edges] = row[skip : skip + len(edges)]
+
+    while recoveries := [event for event in passed.estimate.events if event.kind == "recovery"]:
+        event = min(recoveries, key=lambda event: event.end)
+        memory = filtered(_part(problem, begin, event.end, problem.initial), replace(options, every=len(time))).end.gate
+        assert memory is not None
+        since = max(memory.counts[SINCE], begin)
+        if since == begin and passed is not whole:  # another candidate than that with which this part starts
+            since = event.end
+        state = problem.initial
+        for first, end in itertools.pairwise((begin, max(event.start, begin), since)):
+            if end > first:
+                part = _part(problem, first, end, state)
+                of_part, rows = _smoothed(part, options, kind)
+                state = of_part.end
+                write(part, rows)
+        if since == last:
+            return whole, outputs
+        problem = _part(problem, since, last, _candidate(problem, options, state, memory, since))
+        begin, passed = since, filtered_whole(problem, options)
+    rows = kind(problem).outputs(len(problem.record.time), options)
+    kind(problem).go_back(passed.segments, segment_starts(problem, passed.segments), 0, rows)
+    write(problem, rows)
+    return whole, outputs
 
 
 def filtered_whole(problem: Problem, options: Options) -> Passed:
