@@ -42,6 +42,16 @@ def many() -> Statistics:
 # ----------------------------------------------------------------------------------------------------- the same runs
 
 
+def test_an_equal_plan_whose_preparation_is_used_may_be_deleted_meanwhile(monkeypatch):
+    class Forgotten(dict):
+        def __setitem__(self, plan, prepared):
+            pass
+
+    for machine, name in ((lanes, "_PREPARED"), (scalar, "_SCENARIOS")):
+        monkeypatch.setattr(machine, name, Forgotten())
+        machine.replay(PLAN, 3)
+
+
 def test_the_replay_is_the_run_bit_for_bit():
     chunk = lanes.run_chunk(PLAN, 3, 1)
     replay = lanes.replay(PLAN, 3)

@@ -155,9 +155,10 @@ _PREPARED: weakref.WeakKeyDictionary[Plan, _Prepared] = weakref.WeakKeyDictionar
 
 
 def _prepared(plan: Plan) -> _Prepared:
-    if plan not in _PREPARED:
-        _PREPARED[plan] = _prepare(plan)
-    return _PREPARED[plan]
+    prepared = _PREPARED.get(plan)  # once: an equal plan, the key, may be deleted at any time
+    if prepared is None:
+        prepared = _PREPARED[plan] = _prepare(plan)
+    return prepared
 
 
 def _quiet(spec: GyroSpec) -> GyroSpec:

@@ -51,9 +51,10 @@ def start(
 
 def record_of(plan: Plan, run: int) -> ImuRecord:
     """Return the record of one run of a plan."""
-    if plan not in _SCENARIOS:
-        _SCENARIOS[plan] = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
-    return simulate(unit(plan, run, _SCENARIOS[plan]), plan.seed, run)
+    scenario = _SCENARIOS.get(plan)  # once: an equal plan, the key, may be deleted at any time
+    if scenario is None:
+        scenario = _SCENARIOS[plan] = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
+    return simulate(unit(plan, run, scenario), plan.seed, run)
 
 
 class _Remembered:
