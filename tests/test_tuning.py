@@ -452,6 +452,19 @@ def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     ) == pytest.approx(fit.after, abs=0.02)
 
 
+def test_searches_that_have_not_begun_end_with_an_interruption(monkeypatch):
+    searches, search = [], fitting.search
+    monkeypatch.setattr(fitting, "search", lambda *job: searches.append(job) or search(*job))
+
+    def interrupt(words):
+        if words == "searches: 1 of 40":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tuning.fit(tuning.likelihood([case()], BELIEVED, ["gyro.arw"]), starts=40, progress=interrupt)
+    assert len(searches) < 20
+
+
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
     factor = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
     simulated_case = case()

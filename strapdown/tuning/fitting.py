@@ -8,7 +8,7 @@ zero is as likely as the best value. Then only an upper bound is reported.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -211,11 +211,12 @@ def _each(
     """Return ``work`` of each job, distributed over the threads."""
     report = progress or (lambda words: None)
     report(f"{what}: 0 of {len(jobs)}")
+    results: list[T] = []
     with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(work, job) for job in jobs]
-        for done, _ in enumerate(as_completed(futures), 1):
-            report(f"{what}: {done} of {len(jobs)}")
-    return [future.result() for future in futures]
+        for result in pool.map(work, jobs):  # which cancels the rest at an exception or Ctrl-C
+            results.append(result)
+            report(f"{what}: {len(results)} of {len(jobs)}")
+    return results
 
 
 class _Errors(NamedTuple):
