@@ -250,7 +250,7 @@ def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
 
 
 def whole_epochs(scenario: Scenario, filter_setup: FilterSetup) -> int:
-    """Return the largest number of epochs, at most 100, that divide the whole filter steps of a scenario."""
+    """Return the largest number of epochs, at most 100, that divide the filter steps of a scenario; 1 if its last step is not whole."""
     need_setup(filter_setup)
-    steps = round(scenario.duration * scenario.rate) // filter_setup.integration.samples
-    return max(n for n in range(1, 101) if steps % n == 0)
+    samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
+    return max((n for n in range(1, 101) if samples % (n * step) == 0), default=1)
