@@ -147,6 +147,7 @@ def test_what_error_states_reach_is_not_averaged_over_one_run(states, averaged):
 def test_sensors_that_share_an_error_are_reported():
     judgement = consistency.judge(estimate(correlated=True)[0])
     assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1, star 2")]
+    assert f"1 of {len(judgement.findings)} tests contradicts it" in judgement.headline
     few = estimate(samples=consistency.judgement.MIN_SAMPLES - 1, correlated=True)[0]
     assert "cross-correlation" not in {f.name for f in consistency.judge(few).findings}
 

@@ -519,7 +519,8 @@ def _verdict(
     rejected = [finding for finding in findings if finding.rejected]
     if rejected:
         leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
-        return "not consistent", f"{leaning}; {len(rejected)} of {len(findings)} tests contradict it"
+        contradict = "contradicts" if len(rejected) == 1 else "contradict"
+        return "not consistent", f"{leaning}; {len(rejected)} of {len(findings)} tests {contradict} it"
     if not findings:
         without = any(part.why == NO_COVARIANCE for part in parts)
         return "cannot tell", f"{NO_COVARIANCE if without else 'no innovation, and no truth'}: nothing to test"
