@@ -44,7 +44,7 @@ def misfit(result: AhrsEstimate, motion: str) -> str:
         shown = f"between rests the gyro's bias is estimated to change by up to {departure / DEGREE:.2g} deg/s, as no gyro's does"
     else:
         return ""
-    words = f"The model of the motion, that of a {motion}, does not suit: {shown}. Errors may exceed their σ."
+    words = f"The motion model ({motion}) does not suit: {shown}. Errors may exceed their σ."
     if motion != "vehicle":
         words += f" Acceleration that lasts for seconds is that of a vehicle ({Hint('motion', 'vehicle')})."
     return words
