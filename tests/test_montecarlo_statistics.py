@@ -413,7 +413,7 @@ def test_whole_epochs_cut_into_whole_steps():
     assert montecarlo.whole_epochs(SCENARIO, SETUP) == 80
     assert montecarlo.whole_epochs(SCENARIO, four) == 60
     longer = replace(SCENARIO, duration=2.41)
-    with pytest.raises(InputError, match="epochs of whole four-sample steps; .* a multiple of 4,"):
+    with pytest.raises(InputError, match=r"epochs of whole four-sample steps; .* a multiple of 4,"):
         planned(scenario=longer, setup=four, epochs=montecarlo.whole_epochs(longer, four))
 
 

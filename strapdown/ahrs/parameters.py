@@ -23,7 +23,7 @@ class AhrsParameters:
 
     Noises of the vectors are densities: σ of a mean over one second, whatever the recording's rate. They are much larger than the sensors'
     own noise, because disturbances last over many samples. With ``velocity_sigma`` the acceleration has states
-    (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is the remaining noise.
+    (:class:`strapdown.estimation.error_states.BoundedVelocity`), and ``specific_force_noise`` is the remaining noise.
 
     Parameters
     ----------

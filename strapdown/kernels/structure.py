@@ -1,7 +1,7 @@
 """The filter of N error states as data: its structure, known while its kernels are compiled, and the arrays on which they work.
 
 A number of the model is an *entry*: 0 or 1, which cost nothing at run time, or a place in the array ``numbers`` of the filter, as a tuple
-of one index. :func:`strapdown.estimation.model.structure` makes a structure from the declarations of error states.
+of one index. :func:`strapdown.estimation.model.assemble` makes a structure from the declarations of error states.
 """
 
 from __future__ import annotations
