@@ -196,9 +196,10 @@ def _smoothed(problem: Problem, options: Options, kind: type[_SixStates | _ManyS
             return whole, outputs
         problem = _part(problem, since, last, _candidate(problem, options, state, memory, since))
         begin, passed = since, filtered_whole(problem, options)
-    rows = kind(problem).outputs(len(problem.record.time), options)
+    rows = outputs if passed is whole else kind(problem).outputs(len(problem.record.time), options)
     kind(problem).go_back(passed.segments, segment_starts(problem, passed.segments), 0, rows)
-    write(problem, rows)
+    if passed is not whole:
+        write(problem, rows)
     return whole, outputs
 
 
