@@ -17,7 +17,6 @@ from strapdown.ahrs.parameters import HAND_HELD_SMOOTHED as HAND_HELD_SMOOTHED
 from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER as HAND_HELD_WITHOUT_MAGNETOMETER
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
 from strapdown.ahrs.parameters import of_motion as of_motion
-from strapdown.ahrs.preparing import Prepared as Prepared
 from strapdown.ahrs.preparing import prepare as prepare
 from strapdown.ahrs.preparing import without_temperature as without_temperature
 from strapdown.ahrs.remarks import MotionWarning

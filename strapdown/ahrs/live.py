@@ -183,8 +183,7 @@ class LiveAhrs:
         estimate = imu.attitude, imu.bias, imu.variance, imu.covariance
         at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
         stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
-        of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now
-        of_step_too = a.turn_variance, self._rests.rest_bias
+        of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
         heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
         samples = imu.time, imu.gyro, imu.accelerometer, imu.magnetic if self.magnetometer else imu.magnetic[:0]
         at_rest = starting.kernel.Means(a.found_rate, a.found_rest, a.found_gained, a.found_bias)
@@ -203,7 +202,7 @@ class LiveAhrs:
             average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
             head=(
                 constants,
-                headings.kernel.Steps(*map(r, (*of_step, *of_step_too))),
+                headings.kernel.Steps(*map(r, (*of_step, self._rests.rest_bias))),
                 self._memory,
                 headings.kernel.Outputs(*heading),
             ),
