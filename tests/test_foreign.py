@@ -329,6 +329,7 @@ FAULTS = {
         "body frame rotated (mounting)",
         [0.0, -1.5, 0.0],
     ),
+    "fixed read as body": ({"covariance": fixed_side, "error_frame": "body"}, "covariance meant as fixed", [100.0]),
 }
 
 

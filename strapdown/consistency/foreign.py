@@ -9,7 +9,7 @@ rotation between frames and a constant error of the filter are indistinguishable
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -214,8 +214,10 @@ def check_attitudes(
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
         derivatives = jacobian(common.time, aligned, true)
-        unestimated = true.bias if common.bias is not None and not common.bias.any() else None
-        explained = explanations(error, readings[frame], derivatives, unestimated, confidence_level=confidence_level)
+        others = list(_other_frames(error, readings, frame, probabilities))
+        if common.bias is not None and not common.bias.any():
+            others.append(_zero_bias(true.bias, readings[frame]))
+        explained = explanations(error, readings[frame], derivatives, others, confidence_level=confidence_level)
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
     estimate = replace(estimate, truth=true, motion=own.motion)
@@ -317,19 +319,17 @@ def explanations(
     error: Array,
     covariance: Array,
     derivatives: Array,
-    unestimated: Array | None = None,
+    others: Sequence[Explanation] = (),
     *,
     confidence_level: float = 0.99,
 ) -> tuple[Explanation, ...]:
     """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
-    ``derivatives`` (m, 3, 7) are those of :func:`jacobian`; ``unestimated`` (m, 3) is the gyro's bias if the filter holds it at zero. For
-    a consistent filter none is likely with ``confidence_level``.
+    ``derivatives`` (m, 3, 7) are those of :func:`jacobian`, ``others`` further candidates. For a consistent filter none is likely with
+    ``confidence_level``.
     """
     P = covariance[:, :3, :3]
-    candidates = [*_constant_differences(error, P, derivatives), _wrong_scale(whitened(error, P))]
-    if unestimated is not None:
-        candidates.append(_zero_bias(unestimated, covariance))
+    candidates = [*_constant_differences(error, P, derivatives), _wrong_scale(whitened(error, P)), *others]
     likely = holm([candidate.p_value for candidate in candidates], 1.0 - confidence_level)
     marked = [replace(candidate, likely=is_likely) for candidate, is_likely in zip(candidates, likely, strict=True)]
     # Specific causes come before a factor on σ, which would absorb all of them.
@@ -372,6 +372,17 @@ def _zero_bias(bias: Array, P: Array) -> Explanation:
     rms, sigma = np.sqrt(3.0 * np.mean(bias**2)), np.sqrt(np.mean(np.trace(P[:, 3:, 3:], axis1=1, axis2=2)))
     value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
     return Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0)
+
+
+def _other_frames(
+    error: Array, readings: Mapping[str, Array], frame: str, probabilities: Mapping[str, float]
+) -> Iterator[Explanation]:
+    """Yield the definitions of the covariance that the errors fit better than the one used."""
+    for name, P in readings.items():
+        if probabilities[name] > probabilities[frame]:
+            value, nees = f"{100.0 * probabilities[name]:.3g} %", float(np.mean(whitened(error, P[:, :3, :3]) ** 2))
+            p_value = probabilities[frame] / probabilities[name]
+            yield Explanation(name=f"covariance meant as {name}", value=value, nees=nees, p_value=p_value)
 
 
 def _constant_p_value(total: Array, scores: Array) -> float:
