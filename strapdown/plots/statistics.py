@@ -60,9 +60,9 @@ def nees_over_time(
 
 
 def nis_over_time(
-    named: Sequence[tuple[str, Statistics]], ax: Axes | None = None, *, probability: float = 0.99, label: str = ""
+    named: Sequence[tuple[str, Statistics]], ax: Axes | None = None, *, label: str = "99 % bounds, each interval"
 ) -> Axes:
-    """Draw the mean NIS per degree of freedom in each interval of time, with the bounds of one interval.
+    """Draw the mean NIS per degree of freedom in each interval of time, with the 99 % bounds of one interval.
 
     Parameters
     ----------
@@ -70,10 +70,8 @@ def nis_over_time(
         Statistics, each with its name for the legend.
     ax : Axes, optional
         Axes to draw on. Default: those of a new figure.
-    probability : float
-        Probability that the mean of a consistent filter over one interval is within the bounds.
     label : str
-        Legend of the bounds. Default: their confidence level.
+        Legend of the bounds.
 
     Returns
     -------
@@ -86,8 +84,7 @@ def nis_over_time(
         ax.plot(statistics.nis_time[measured], statistics.nis[measured], label=name, **style.layered(k, len(named)))
     first = named[0][1]
     typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
-    words = label or f"{100 * probability:g} % bounds, each interval"
-    ax.axhspan(*mean_bounds(1, typical, probability), color=style.ink(), alpha=0.12, linewidth=0, label=words)
+    ax.axhspan(*mean_bounds(1, typical), color=style.ink(), alpha=0.12, linewidth=0, label=label)
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
     return ax
