@@ -277,23 +277,22 @@ def test_a_second_estimate_is_interpolated_by_rotation_at_constant_rate():
 
 
 def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
-    findings = [SimpleNamespace(rejected=True, means="odd"), SimpleNamespace(rejected=False, means="even")]
-    verdicts = [
-        SimpleNamespace(verdict=verdict, reason=verdict, findings=[]) for verdict in ("consistent", "cannot tell")
-    ]
-    verdicts[0].findings = findings
+    odd, even = (SimpleNamespace(rejected=True, means=name) for name in ("odd", "even"))
+    pairs = (("cannot tell", []), ("not consistent", [odd]), ("not consistent", [even, odd]), ("consistent", []))
+    verdicts = [SimpleNamespace(verdict=verdict, reason="r", findings=findings) for verdict, findings in pairs]
     after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
     comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
     tuned, verdict = SimpleNamespace(comparison=comparison, composite=False), sd.tuning.Tuning.verdict.fget
     answer, reason, details = verdict(tuned)
-    assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
-    assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
+    assert (answer, reason) == ("not consistent", "r, on the held-out data of the worst record")
+    assert details == ["even", "odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
     comparison.better = True
-    assert verdict(tuned)[2] == ["odd"]
-    after.attitude_rms = 1.1
-    assert verdict(tuned)[2] == [
-        "odd", "on the held-out data the attitude error has increased: keep the previous filter"
-    ]  # fmt: skip
+    assert verdict(tuned)[2] == ["even", "odd"]
+    after.attitude_rms, after.judgements = 1.1, verdicts[::3]
+    details = ["on the held-out data the attitude error has increased: keep the previous filter"]
+    assert verdict(tuned) == ("cannot tell", "r, on the held-out data of the worst record", details)
+    after.judgements = verdicts[:1]
+    assert verdict(tuned)[1] == "r, on held-out data"
 
 
 def test_packed_numbers_are_read_back():

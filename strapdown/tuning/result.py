@@ -223,13 +223,15 @@ class Tuning(Listed):
                 return "cannot tell", f"the data used for tuning are too few to judge the filter; {prove}", []
             return "consistent", f"the tuned filter agrees with the data used for tuning; {prove}", []
         judgements = comparison.after.judgements
-        worst = max(judgements, key=lambda judgement: VERDICTS.index(judgement.verdict))
-        details = [finding.means for judgement in judgements for finding in judgement.findings if finding.rejected]
+        order = lambda judged: (VERDICTS.index(judged.verdict), sum(finding.rejected for finding in judged.findings))  # noqa: E731
+        worst = max(judgements, key=order)
+        details = [finding.means for finding in worst.findings if finding.rejected]
         if not comparison.better and not self.composite:
             details.append("on the held-out data the likelihood has decreased: keep the previous filter")
         elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
             details.append("on the held-out data the attitude error has increased: keep the previous filter")
-        return worst.verdict, f"{worst.reason}, on held-out data", details
+        data = "held-out data" if len(judgements) == 1 else "the held-out data of the worst record"
+        return worst.verdict, f"{worst.reason}, on {data}", details
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
