@@ -213,8 +213,8 @@ def coning_json(tmp_path_factory):
 def test_a_coning_study_is_reported_from_its_json(coning_json, tmp_path):
     study = json.loads(coning_json.read_text())
     content = body(report.write(coning_json).page)
-    passing = sum(row["verdict"] == "consistent" for row in study["filter"])
-    assert f"{passing} of {len(study['filter'])} algorithms give a consistent filter" in content.split("<h2>")[0]
+    assert {row["verdict"] for row in study["filter"][1:]} == {"cannot tell"}  # of one short run
+    assert "Not consistent with one-sample; cannot tell with two-sample, three-sample" in content.split("<h2>")[0]
     drift = charts_of(content)[0]
     assert drift["ticks"] == [row["algorithm"] for row in study["integration"]]
     measured = [abs(row["drift_deg_per_hour"]) for row in study["integration"]]

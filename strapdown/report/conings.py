@@ -31,9 +31,10 @@ def _page(path: Path, study: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     size = lambda x: None if x is None or abs(x) <= coning_study.ROUNDING else abs(x)  # noqa: E731
     sizes = [{key: size(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")} for row in drifts]
     answer = max((row["verdict"] for row in filters), key=VERDICTS.index)
-    passing = [row["integration"] for row in filters if row["verdict"] == "consistent"]
-    reason = f"{len(passing)} of {len(filters)} algorithms give a consistent filter"
-    reason += f": {', '.join(passing)}" if passing else ""
+    names = {verdict: [row["integration"] for row in filters if row["verdict"] == verdict] for verdict in VERDICTS}
+    reason = "; ".join(
+        f"{verdict} with {', '.join(names[verdict])}" for verdict in reversed(VERDICTS) if names[verdict]
+    )
     content = page.page(
         "Coning study",
         coning_study.words(study),
