@@ -261,7 +261,7 @@ def test_the_command_writes_a_filter_that_compiles_and_says_what_it_is(run, tmp_
         (("hand", "--rate", "-1"), "rate is -1"),
         (("hand", "--rate", "1e7"), "interval is 1e-07 s; give that of the samples"),
         (("filter.toml", "flight.HDF5"), "flight.HDF5 does not exist"),
-        (("filter.toml", "--rate", "100"), "rate and magnetometer are of an IMU"),
+        (("filter.toml", "--rate", "100"), "error: give --rate and --magnetometer only with a motion"),
     ],
 )
 def test_the_command_refuses_what_does_not_belong_together(arguments, words, run):

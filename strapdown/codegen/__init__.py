@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Literal
 import strapdown
 from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.parameters import MOTIONS, of_motion
-from strapdown.checks import InputError, instance, one_of, positive
+from strapdown.checks import Hint, InputError, instance, one_of, positive
 from strapdown.codegen import c, design, javascript
 from strapdown.codegen.target import traced
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
@@ -105,7 +105,7 @@ def export(
     if isinstance(setup, str) and setup in MOTIONS:
         setup = _of_motion(setup, rate, magnetometer=magnetometer)
     elif rate is not None or magnetometer:
-        raise InputError(f"rate and magnetometer are of an IMU, with a motion: {', '.join(MOTIONS)}; leave them out")
+        raise InputError(f"give {Hint('rate')} and {Hint('magnetometer')} only with a motion: {', '.join(MOTIONS)}")
     elif not isinstance(setup, FilterSetup | LiveAhrs):
         setup = read_setup(setup)
     usable_folder("folder", folder)
