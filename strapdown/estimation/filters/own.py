@@ -135,9 +135,10 @@ class Own:
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
         """Run the filter over a record without its truth, and check the result; if ``times`` of edges are given, return only those."""
         if isinstance(self.definition, Mapping):
+            file = self.table.get("file")
+            again = Hint("estimator", file) if file else "replace(plan.setup, estimator=…)"
             raise InputError(
-                f"{self.name} is a filter of your own, whose code is not in the result file; give it again, "
-                f"{Hint('estimator', self.table.get('file', 'FILE.py:NAME'))}, as in replace(plan, setup=replace(plan.setup, estimator=…))"
+                f"{self.name} is a filter of your own, whose code is not in the result file; give it again, {again}"
             )
         function = _function(_copied(self.definition, self.name))
         try:
