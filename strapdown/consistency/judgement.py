@@ -445,7 +445,7 @@ def _over_run(estimate: Estimate, subset: str, e: Array, P: Array) -> Finding | 
     states = SUBSETS[subset]
     average = time_average(e, P, states)
     if not average.reliable:
-        return f"its error changes too slowly for this run, {average.effective:.2g} effective samples"
+        return f"its error changes too slowly, effective number of samples {average.effective:.2g}"
     size = (average.mean, len(states), average.effective)
     words = error_words(f"the {subset} error over the run", average.mean)
     return ratio("time-averaged NEES", subset, *size, words, average.certainty)
