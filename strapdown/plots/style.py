@@ -13,7 +13,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullLocator
+from matplotlib.ticker import AutoLocator, LogFormatterSciNotation, LogLocator, NullLocator
 
 from strapdown.checks import one_of
 from strapdown.files import atomic_write
@@ -118,13 +118,13 @@ def label_alike(figure: Figure) -> None:
 
 
 class _LogLocator(LogLocator):
-    """Places of labels; at powers of ten only if there would be more than ten labels."""
+    """Places of labels; at powers of ten only if there would be more than ten labels, at equal distances if there would be one."""
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the places, of which some may be outside of the limits."""
         ticks = super().tick_values(vmin, vmax)
-        few = sum(vmin <= tick <= vmax for tick in ticks) <= 10
-        return ticks if few else LogLocator().tick_values(vmin, vmax)
+        number = sum(vmin <= tick <= vmax for tick in ticks)
+        return ticks if 2 <= number <= 10 else (AutoLocator() if number < 2 else LogLocator()).tick_values(vmin, vmax)
 
 
 def log_scale(ax: Axes) -> None:
