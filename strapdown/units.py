@@ -51,8 +51,9 @@ _STATE_UNITS: dict[str, dict[str, tuple[str, float]]] = {
 }
 
 
-def error_state_name(block: str, component: str) -> str:
-    """Return the name of one state from those of its declaration and its component, which may begin with the same word."""
+def error_state_name(block: str, component: str, unit: str) -> str:
+    """Return the name of one state from its declaration, its component, which may begin with the same word, and its SI unit."""
+    block = "gyro misalignment" if (block, unit) == ("gyro scale", "rad") else block
     return f"{block} {component.removeprefix(block.rsplit(maxsplit=1)[-1]).strip()}".strip()
 
 

@@ -625,7 +625,7 @@ def test_a_gyro_scale_needs_a_turn_about_each_axis():
         ranks[name] = observability.rank
         if name == "about z":
             names = [observability.states[k] for k in np.flatnonzero(observability.unobserved < 0.5)]
-            assert names[6:] == ["gyro scale xz", "gyro scale yz", "gyro scale z"]
+            assert names[6:] == ["gyro misalignment xz", "gyro misalignment yz", "gyro scale z"]
     assert ranks == {"still": 6, "about z": 9, "about all": 15}
 
 

@@ -114,7 +114,7 @@ def state_names(blocks: Sequence[ErrorStates]) -> tuple[tuple[str, ...], tuple[s
     names = [f"attitude {axis}" for axis in AXES] + [f"gyro bias {axis}" for axis in AXES]
     units = ["rad"] * 3 + ["rad/s"] * 3
     for block in blocks:
-        names += [error_state_name(block.name, component) for component in block.components]
+        names += map(error_state_name, [block.name] * block.size, block.components, block.units)
         units += block.units
     return tuple(names), tuple(units)
 

@@ -18,7 +18,7 @@ from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
 from strapdown.records import Estimate, Truth, outputs
-from strapdown.units import DEGREE, angle_unit, rate_unit
+from strapdown.units import DEGREE, angle_unit, error_state_name, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""
@@ -159,8 +159,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(word)
-        what = name.replace("scale", "misalignment") if (word, size) == ("mrad", 1e-3) else name
-        ax.set_title(what, loc="left")
+        ax.set_title(error_state_name(name, "", unit), loc="left")
         style.legend_above(ax, ncols=min(len(members), 9))
     axes[-1].set_xlabel("time, s")
     axes[-1].set_xlim(estimate.time[0], estimate.time[-1])

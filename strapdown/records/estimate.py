@@ -288,7 +288,7 @@ class Estimate(ByValue, Listed):
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
-                label, (word, size) = error_state_name(name, component), self.state_unit(name, unit)
+                label, (word, size) = error_state_name(name, component, unit), self.state_unit(name, unit)
                 rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, innovations in self.innovations.items():
