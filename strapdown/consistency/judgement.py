@@ -299,7 +299,7 @@ def judge(
             findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used])
             untested[f"{INNOVATIONS}{sensor}"] = ""
         if innovations.refused:
-            limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
+            limits.append(f"{innovations.refused} of {len(used)} measurements of {sensor} rejected by the gate")
     findings += _of_pairs(estimate)
     why = NO_TRUTH if estimate.has_covariance else NO_COVARIANCE
     untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], why)
