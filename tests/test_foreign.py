@@ -740,6 +740,16 @@ def test_a_definition_of_the_covariance_that_thousands_of_errors_show_is_certain
     assert foreign.frame_probabilities(error, readings)["euler"] < 1e-300
 
 
+def test_after_a_slew_about_one_axis_no_rotation_is_invented():
+    """The part of both rotations about that axis is only determined together; a difference of the fixed frames alone fits."""
+    time = np.arange(0.0, 60.0, 0.2)
+    exact = quaternion.exp(np.outer(np.sin(0.1 * time), [0.3, 0.9, 0.2]))
+    noise = quaternion.exp(1e-5 * np.random.default_rng(1).standard_normal((len(time), 3)))
+    own = quaternion.multiply(quaternion.exp([0.0, 0.0, 0.2]), quaternion.multiply(exact, noise))
+    a = alignment.fit(alignment.Series(time, own), alignment.Series(time, exact), alignment.ALIGNED, 0.0)
+    np.testing.assert_allclose([a.fixed, a.body], [[0.0, 0.0, -0.2], np.zeros(3)], atol=1e-4)
+
+
 def test_an_alignment_is_described_with_its_sigma():
     sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
     fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE

@@ -259,6 +259,10 @@ def _descended(
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
         left = r - np.einsum("mij,j->mi", J, step[free])
         share = len(r) / effective_samples(left, of_mean=True) if len(r) > 10 else 1.0
+        if free[:6].all():  # a slew determines only the sum of both turns about its axis: that of the body is zero
+            value, vector = np.linalg.eigh(information[:6, :6])
+            both = vector[:, value <= 1e-6 * value[-1]]
+            step[:6] += both @ np.linalg.lstsq(both[3:], -quaternion.log(body) - step[3:6], rcond=None)[0]
         covariance = np.zeros((7, 7))
         covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
         fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
