@@ -42,7 +42,7 @@ class GyroSpec(ByValue):
     Parameters
     ----------
     angle_random_walk : float or ndarray (3,), default 0.0
-        Angle random walk σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
+        Angle random walk σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s. The filter has one for all axes, that of the noisiest.
     rate_random_walk : float or ndarray (3,), default 0.0
         Rate random walk σ_u (K) of the bias, rad/s/√s, from 0 at the first edge.
     bias_instability : float or ndarray (3,), default 0.0
