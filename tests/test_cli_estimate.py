@@ -98,7 +98,7 @@ def spinning(files):
     return files / "spin.h5"
 
 
-def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds, record, tmp_path):
+def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds, refusal, record, tmp_path):
     said = succeeds("estimate", record, "--out", tmp_path / "out", "--figures")
     assert "Started from the first measurements" in said
     assert "Gyro bias: RMS error" in said
@@ -117,6 +117,10 @@ def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds,
     assert 0.0 < errors["bias"]["rms_deg_per_h"] < 3.0 * errors["bias"]["sigma_deg_per_h"]
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         assert np.array_equal(file["truth/attitude"][:], truth.attitude)
+    for command in ("estimate", "tune"):
+        assert "a result, not a recording" in refusal(
+            command, tmp_path / "out" / "estimate.h5", "--out", tmp_path / "2.toml"
+        )
 
 
 def test_a_filter_from_a_file_and_the_options(succeeds, record, tmp_path):

@@ -150,7 +150,7 @@ def estimate(
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
     options, field = _options(shared, specified, recorded), recorded.field
     with ui.progress_bar("reading"):
-        source: Any = sd.read(recording, **layout.options)
+        source: Any = (sd.read if simulated else sd.recordings.read)(recording, **layout.options)
     if field is not None and source.magnetic_field is None:
         raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
     if not simulated:

@@ -76,7 +76,7 @@ def tune(
     sources: dict[str, Any] = {}
     for path in records:
         simulated = sd.recordings.is_record(path)
-        source: Any = sd.read(path, **({} if simulated else layout.options))
+        source: Any = sd.read(path) if simulated else sd.recordings.read(path, **layout.options)
         if start.states and not simulated:
             raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
         ui.say("" if simulated else source.left_out_words)
