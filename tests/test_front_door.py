@@ -268,6 +268,7 @@ def test_files_are_recognised_by_their_content(tmp_path):
         lambda: sd.estimate(sd.simulate(scenario(5.0)), noise=3.0),
         lambda: sd.tune("record.h5"),
         lambda: sd.tune([]),
+        lambda: sd.tune(3),
         lambda: sd.integrate("record.h5"),
         lambda: sd.check(3),
         lambda: sd.check(sd.estimate(sd.simulate(scenario(5.0))), np.zeros(3)),

@@ -120,7 +120,7 @@ def _by_name(sources: Source | Sequence[Source] | Mapping[str, Source]) -> Mappi
     from strapdown.tuning import Case
 
     if not isinstance(sources, Mapping):
-        listed = [sources] if isinstance(sources, (ImuRecord, Recording, Case, str, os.PathLike)) else list(sources)
+        listed = sources if isinstance(sources, (list, tuple)) else [sources]
         sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
     if not sources:
         raise InputError("sources is empty; give at least one record or recording")
