@@ -287,7 +287,7 @@ def test_the_gate_is_described_by_the_share_that_it_refuses():
         gate=Gate(probability=1.0 - 1e-5), probability=1.0 - 1e-5, lower=1.0 - 4e-5, upper=1.0 - 2e-6, thresholds={"st": 25.0},
         share=share,
     )  # fmt: skip
-    assert described.words.endswith("The gate refuses 0.001 % of valid measurements (95 %: 0.0002 to 0.004).")
+    assert described.words.endswith("The gate rejects 0.001 % of valid measurements (95 %: 0.0002 to 0.004).")
 
 
 @pytest.mark.slow

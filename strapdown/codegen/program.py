@@ -37,7 +37,7 @@ OK, BAD_INPUT, REJECTED, NO_HEADING, TOO_PRECISE, NOT_STARTED = 0, 1, 2, 4, 8, 1
 MEANINGS = {
     "OK": (OK, "The sample was used."),
     "BAD_INPUT": (BAD_INPUT, "Not finite, no length, dt not in (0, 3600] s, or a turn of over 100 rad: not used."),
-    "REJECTED": (REJECTED, "The gate refused the measurement: not used. After many in a row, start again by init."),
+    "REJECTED": (REJECTED, "The gate rejected the measurement: not used. After many in a row, start again by init."),
     "NO_HEADING": (NO_HEADING, "The vector was vertical and has no heading: not used."),
     "TOO_PRECISE": (TOO_PRECISE, "So much more precise than the state that P would keep no digits: not used."),
     "NOT_STARTED": (NOT_STARTED, "Waits for a sample with a specific force and, with a magnetometer, a field."),

@@ -86,7 +86,7 @@ class TunedGate:
         thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in self.thresholds.items())
         refused, least, most = (100.0 * (1.0 - p) for p in (self.probability, self.upper, self.lower))
         return (
-            f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate refuses "
+            f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate rejects "
             f"{refused:.2g} % of valid measurements (95 %: {least:.2g} to {most:.2g})."
         )
 
