@@ -220,7 +220,7 @@ def check_attitudes(
         explained = explanations(error, readings[frame], derivatives, others, confidence_level=confidence_level)
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
-    estimate = replace(estimate, truth=true, motion=own.motion)
+    estimate = replace(estimate, truth=true, motion=own.motion, remarks=tuple(f"Note: {words}." for words in remarks))
     estimate = replace(estimate, origin=Origin(source=own.source), details={"truth": truth.source})
     return Checked(
         judgement=judge(estimate, **how),
