@@ -292,6 +292,9 @@ def test_a_refused_object_is_named_by_its_class_and_a_text_in_place_of_names_as_
 
 def test_check_refuses_the_truth_of_another_record():
     estimate = sd.estimate(sd.simulate(scenario(10.0)))
+    for other in (sd.check, sd.diagnose, sd.accuracy):
+        with pytest.raises(sd.InputError, match="record is of seed 7, run 0, and the estimate of seed 3"):
+            other(estimate, sd.simulate(scenario(10.0), seed=7))
     with pytest.raises(sd.InputError, match="stamps"):
         sd.check(estimate, sd.simulate(dataclasses.replace(scenario(10.0), rate=40.0, duration=5.0)))
     with pytest.raises(sd.InputError, match="epochs"):

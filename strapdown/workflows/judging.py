@@ -117,6 +117,7 @@ def diagnose(
     if unknown or not np.isin(result.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
         raise InputError(f"the record {what}; the estimate was made from another record")
+    _need_same_draw(result, record)
     if filter_setup.states is not None and filter_setup.states.names:
         names = ", ".join(filter_setup.states.names)
         return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
@@ -162,6 +163,14 @@ def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes 
     return accuracy_of(own, Series(truth.seconds(0), truth.attitude, movement=truth.movement))
 
 
+def _need_same_draw(result: Estimate, record: ImuRecord) -> None:
+    """Raise an error for a simulated record of another seed or run than that of the estimate; their time stamps are the same."""
+    origins = [origin for origin in (record.origin, result.origin) if origin is not None and origin.seed is not None]
+    drawn = [f"of seed {origin.seed}, run {origin.run}" for origin in origins]
+    if len(set(drawn)) > 1:
+        raise InputError(f"the record is {drawn[0]}, and the estimate {drawn[1]}; give the record of the estimate")
+
+
 def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> Truth | None:
     """Return the truth at the epochs of an estimate."""
     if truth is None or isinstance(truth, Truth):
@@ -171,11 +180,10 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
             )
         return truth
     instance(
-        "truth",
-        truth,
-        (ImuRecord, Recording),
-        "give the record, the recording, or a Truth at the epochs of the estimate",
+        "truth", truth, (ImuRecord, Recording), "give the record, the recording, or a Truth at the estimate's epochs"
     )
+    if isinstance(truth, ImuRecord):
+        _need_same_draw(result, truth)
     whole = truth.truth if isinstance(truth, ImuRecord) else None
     if isinstance(truth, Recording) and truth.true_attitude is not None:
         whole = Truth(attitude=truth.true_attitude, movement=truth.movement)
