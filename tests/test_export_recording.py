@@ -274,7 +274,7 @@ def test_a_live_filter_has_its_sensors_and_a_setup_has_not(tmp_path):
     live, _ = case("hand")
     with pytest.raises(InputError, match="has its own"):
         sd.export(live, [], folder=tmp_path)
-    with pytest.raises(InputError, match="of an IMU, with a motion: hand, "):
+    with pytest.raises(InputError, match="only with a motion: hand, "):
         sd.export(live, folder=tmp_path, rate=100.0)
     with pytest.raises(InputError, match="no sensor"):
         sd.export(live.parameters.setup, folder=tmp_path)
