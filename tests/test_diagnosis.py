@@ -203,6 +203,13 @@ ORBITAL = setup.FilterSetup(
 )
 
 
+def test_a_right_filter_of_two_antennas_is_given_no_cause():
+    """Their baseline is exact: a bias along it changed no innovation, but its hypothesis raised their σ."""
+    record = sd.simulate(replace(scenarios.load_scenario("ship"), duration=60.0))
+    causes, _ = sd.diagnose(sd.estimate(record), record)
+    assert causes.judgement.verdict == "cannot tell"
+
+
 def test_the_noise_of_a_gyro_is_not_taken_for_a_scale_factor():
     """To scale the increments is to scale their noise too, and a filter with less noise has smaller innovations."""
     record = scenarios.simulate(SLOW_TURN, seed=0)

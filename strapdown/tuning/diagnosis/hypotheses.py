@@ -37,7 +37,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
     for series in measured:
         yield _time_offset(series.sensor, (series.sensor,), interval)
         yield _mounting(series)
-        if series.kind != "attitude":
+        if series.kind != "attitude" and np.ptp(series.vector_b, axis=0).any():  # the baseline of two antennas is exact
             yield _body_fixed(series)
         if series.kind == "vector":
             yield _reference_length(series)
