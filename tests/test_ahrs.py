@@ -552,6 +552,21 @@ def test_after_a_first_rest_in_a_steady_turn_the_true_ones_are_used():
     assert rests_of(lying(40, 5.0 * DEGREE * (np.arange(400) < 200))).last[-1] == 399
 
 
+ALTERNATING = np.where(np.arange(7000) % 2, 1.0, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"),
+    [
+        (5.0 + 0.2 * ALTERNATING * (np.arange(7000) < 10), 700),  # the first rest is as uncertain as the filter's bias
+        (np.where(np.arange(7000) < 600, 0.0, np.where(np.arange(7000) < 6600, 20.0 * ALTERNATING, 1.0)), 100),
+    ],
+)
+def test_rests_of_a_large_bias_or_of_one_that_drifts_are_no_turns(rate, expected):
+    """A bias of 5 °/s; one that changes by 1 °/s in ten minutes of motion."""
+    assert len(starting.rests(lying(700, rate * DEGREE), ahrs.HAND_HELD_WITHOUT_MAGNETOMETER).last) == expected
+
+
 def test_a_moving_hand_and_a_gap_are_no_rest():
     plain = quiet_second((0.0, 0.0, 0.0))
     swing = 20.0 * DEGREE * np.sin(2.0 * np.pi * 0.7 * plain.time)[:, None] * np.array([1.0, 0.0, 0.5])

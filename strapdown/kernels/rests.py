@@ -58,9 +58,9 @@ class Memory(NamedTuple):
     rest_bias: np.ndarray
     """Bias by all rests (1, 3), rad/s."""
     bias_variance: np.ndarray
-    """Its variance (1,)."""
+    """Variance of the bias that the filter knows (1,)."""
     plausible_variance: np.ndarray
-    """The same, but at first that of any unit: a mean rate that departs by more is a turn (1,)."""
+    """That of the bias by all rests, at first that of any unit: a mean rate that departs by more is a turn (1,)."""
     rest_clock: np.ndarray
     """Time of the first sample of the span, and of the last rest, s (2,)."""
 
@@ -141,9 +141,12 @@ def find_rest(constants, time, memory):
         off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
         spread += dot(off, off)
     variance = constants.own_variance + spread / parts
+    since = time - memory.rest_clock[1]
+    drift = constants.walk * since
+    known, plausible = memory.bias_variance[0] + drift, memory.plausible_variance[0] + drift
     bias = vector_at(memory.rest_bias, 0)
     change = combine(1.0, rate, -1.0, bias)
-    changed = dot(change, change) > constants.odds * (variance + memory.plausible_variance[0])
+    changed = dot(change, change) > constants.odds * (variance + plausible)
     # Unless the new rate is less than half of that bias, which then was a turn itself.
     turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
     with_force, square_force = turned_with(constants, rate, memory, 0)
@@ -157,15 +160,14 @@ def find_rest(constants, time, memory):
     )
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
-    since = time - memory.rest_clock[1]
-    drifted = memory.bias_variance[0] + constants.walk * since
     memory.rest_gained[0] = math.inf
-    if still and variance < drifted:
+    if still and variance < known:
         memory.resting[1] = 1
         memory.rest_gained[0] = constants.unmodelled * since
         memory.rest_clock[1] = time
-        memory.bias_variance[0] = memory.plausible_variance[0] = 1.0 / (1.0 / drifted + 1.0 / variance)
-        store_row(memory.rest_bias, 0, combine(1.0, bias, drifted / (drifted + variance), change))
+        memory.bias_variance[0] = 1.0 / (1.0 / known + 1.0 / variance)
+        memory.plausible_variance[0] = 1.0 / (1.0 / plausible + 1.0 / variance)
+        store_row(memory.rest_bias, 0, combine(1.0, bias, plausible / (plausible + variance), change))
 
 
 def turned_with(constants, rate, memory, first):
