@@ -1317,6 +1317,18 @@ def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
     assert verdicts == ["cannot tell", "not consistent"]  # no truth for the bias
 
 
+def test_without_a_magnetometer_the_heading_of_a_reference_does_not_count():
+    """It is arbitrary, and so is that of the reference: here it is turned by 120°, and unknown in the first second."""
+    plain = recording(60.0, noise=1.0)
+    turned = quaternion.multiply(quaternion.exp([0.0, 0.0, np.deg2rad(120.0)]), plain.true_attitude)
+    turned[:100] = np.nan
+    plain = dataclasses.replace(plain, magnetic_field=None, magnetic_unit="", true_attitude=turned)
+    result = sd.estimate(plain)
+    for truth in (None, plain):
+        assert sd.accuracy(result, truth).given["all samples"]["heading"].maximum < 5.0 * DEGREE
+        assert sd.check(result, truth).verdict == "cannot tell"  # no truth for the bias
+
+
 def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):
     """The sample file of x-io: level at the same heading at both ends, to within a degree, its field disturbed in between."""
     file = broad.parent / "xio" / "sensor_data.csv"

@@ -299,11 +299,13 @@ def _run_recording(
     full = reference is not None if full_covariance is None else full_covariance
     result = ahrs.estimate(source, parameters, gate=gate, robust=robust, full_covariance=full, smooth=smooth, **options)
     used, parameters = result.recording, result.parameters
+    if reference is not None and used.magnetic_field is None:
+        notes.append("The reference is turned about the vertical to the estimate's heading at its first sample.")
     estimate = dataclasses.replace(
         result.estimate,
         setup=dataclasses.replace(parameters.setup, gate=gate, robust=robust),
         origin=Origin(source=used.source, epoch_ns=used.epoch_ns),
-        truth=None if used.true_attitude is None else Truth(attitude=used.true_attitude, movement=used.movement),
+        truth=None if used.true_attitude is None else reference_of(used, slice(None), result.estimate),
         fixed_frame=fixed_frame(used),
         motion=motion,
         smoothed=smooth,
@@ -315,3 +317,19 @@ def _run_recording(
         },
     )
     return Run(estimate, result.record, parameters.setup, result.initial, result)
+
+
+def reference_of(recording: Recording, rows: Any, result: Estimate) -> Truth:
+    """Return the reference at some rows of a recording, those of its estimate.
+
+    Without a magnetometer the heading of the estimate is arbitrary, and the reference is turned to it at its first known attitude.
+    """
+    assert recording.true_attitude is not None
+    truth = Truth(attitude=recording.true_attitude, movement=recording.movement).taken(rows)
+    (known,) = np.nonzero(truth.known)
+    if recording.magnetic_field is None and len(known):
+        attitude = truth.attitude.copy()
+        w, _, _, z = quaternion.multiply(result.attitude[known[0]], quaternion.conjugate(attitude[known[0]]))
+        attitude[known] = quaternion.multiply(quaternion.normalize([w, 0.0, 0.0, z]), attitude[known])
+        truth = dataclasses.replace(truth, attitude=attitude)
+    return truth

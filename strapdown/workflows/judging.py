@@ -18,6 +18,7 @@ from strapdown.recordings import Recording
 from strapdown.recordings.attitudes import Attitudes
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.records.recording import matched
+from strapdown.workflows.estimating import reference_of
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Statistics
@@ -184,12 +185,11 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
     )
     if isinstance(truth, ImuRecord):
         _need_same_draw(result, truth)
-    whole = truth.truth if isinstance(truth, ImuRecord) else None
-    if isinstance(truth, Recording) and truth.true_attitude is not None:
-        whole = Truth(attitude=truth.true_attitude, movement=truth.movement)
-    if whole is None:
-        raise InputError("truth is a record without a truth; leave it out to test the innovations only")
     rows, same = matched(truth.time, result.time, SAME_STAMP)
     if not same.all():
         raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
-    return whole.taken(rows)
+    if isinstance(truth, Recording) and truth.true_attitude is not None:
+        return reference_of(truth, rows, result)
+    if isinstance(truth, ImuRecord) and truth.truth is not None:
+        return truth.truth.taken(rows)
+    raise InputError("truth is a record without a truth; leave it out to test the innovations only")
