@@ -99,6 +99,24 @@ def test_no_interval_goes_over_a_gap(turned):
     assert intervals.gathered([kept]).step.max() < 1.01 / study.RATE
 
 
+def test_noise_is_no_scale_factor():
+    """Of a perfect unit that hardly turns, errors are as likely as their σ: noise of the samples does not make them seem scaled."""
+    random, time = np.random.default_rng(3), 0.02 * np.arange(3000)
+    attitude = Rotation.from_rotvec(0.1 * np.sin(np.outer(time, [0.9, 1.1, 0.7])))
+    rate = (attitude[np.maximum(np.arange(3000) - 1, 0)].inv() * attitude).as_rotvec() / 0.02
+    unit = sd.calibrate(
+        Recording(
+            source="gentle",
+            time=time,
+            rate=rate + 2e-3 * random.standard_normal((3000, 3)),
+            specific_force=attitude.inv().apply([0.0, 0.0, 9.80665]) + 0.03 * random.standard_normal((3000, 3)),
+            magnetic_field=attitude.inv().apply([0.0, 20.0, -43.0]) + 0.4 * random.standard_normal((3000, 3)),
+        )
+    )
+    for name in ("gyro_matrix", "accelerometer_bias", "accelerometer_matrix", "hard_iron", "magnetometer_matrix"):
+        assert np.all(np.abs(getattr(unit, name)) < 3.5 * getattr(unit.sigma, name)), name
+
+
 def test_missing_motion_is_said():
     unit = study.drawn_unit(4)
     recording = study.simulated(unit, 4, 0, 30.0)
@@ -192,8 +210,9 @@ def test_the_equations_have_the_derivatives_of_their_differences(turned):
     np.testing.assert_allclose(equations.residual[equations.kinds["prior"]], (errors - prior.mean) / prior.sigma)
     # the mean of white noise N (m/s²/√Hz) over a time L has σ = N/√L, and a change of velocity Δv over it is the mean force Δv/L
     first = equations.kinds["force"].start + np.arange(3)
-    by_velocity = equations.jacobian[first, fitting.VELOCITY + np.arange(3)]
-    np.testing.assert_allclose(by_velocity, 1.0 / (problem.noise["force"] * np.sqrt(gathered.length[0])))
+    by_velocity = equations.jacobian[first][:, fitting.VELOCITY + np.arange(3)].toarray()
+    to_sensor = (np.eye(3) + fitting.unpacked(errors).accelerometer_matrix) @ attitude[0].T
+    np.testing.assert_allclose(by_velocity, to_sensor / (problem.noise["force"] * np.sqrt(gathered.length[0])))
     step = random.standard_normal(equations.columns)
     change = problem.equations(x.moved(1e-6 * step)).residual - problem.equations(x.moved(-1e-6 * step)).residual
     for rows in equations.kinds.values():

@@ -157,6 +157,26 @@ class _Equations:
         self.rows += count * size
         self.kinds[kind] = slice(start, self.rows)
 
+    def add_measured(
+        self,
+        kind: str,
+        residual: Array,
+        sigma: Array,
+        to_body: Array,
+        matrix: Array,
+        own: tuple[int, Array],
+        *parts: tuple[np.ndarray | int, np.ndarray],
+    ) -> None:
+        """Add residuals (k, 3) of corrected samples, body axes, as those of the samples, whose noise does not depend on the matrix.
+
+        Otherwise larger scale factors would fit better, because the corrected noise is smaller. ``to_body`` (k, 3, 3) takes the
+        derivatives to body axes; ``own``: place of the matrix, and its entries (9, c) by the unknowns there.
+        """
+        measured, (place, entries) = np.eye(3) + matrix, own
+        by_matrix = (np.eye(3)[:, :, None] * residual[:, None, None, :]).reshape(-1, 3, 9) @ entries
+        parts = (*((at, measured @ to_body @ part) for at, part in parts), (place, by_matrix))
+        self.add(kind, residual @ measured.T, sigma, *parts)
+
     @property
     def residual(self) -> Array:
         return np.concatenate(self.residuals)
@@ -237,8 +257,9 @@ class Problem:
         inverse = np.linalg.inv(right_jacobian(e))
         back = -inverse @ np.swapaxes(relative, 1, 2)
         by_bias = 0.5 * back @ p.turn_by[:, :, :3]
-        equations.add(
+        equations.add_measured(
             "rotation", e, self.noise["rotation"] * np.sqrt(self.intervals.length),
+            np.eye(3), unpacked(x.errors).gyro_matrix, (self.errors_at + GYRO.start, np.eye(9)),
             (here + ATTITUDE, back @ np.swapaxes(p.turn, 1, 2)), (there + ATTITUDE, inverse),
             (here + GYRO_BIAS, by_bias), (there + GYRO_BIAS, by_bias),
             (self.errors_at, back @ p.turn_by[:, :, 3:]),
@@ -255,12 +276,14 @@ class Problem:
         by_turn, by_lever = -x.attitude @ skew(across), x.attitude @ skew(rate)
         sigma = self.noise["force"] / np.sqrt(length)
         sigma[self.intervals.force.number == 0.0] = np.inf
-        force = np.einsum("kij,kj->ki", rotation, mean.value) - self.gravity * unit[2]
+        by_node = self.gravity * unit[2] + (v[node + 1] - v[node]) / length[:, None]
+        true = np.einsum("kji,kj->ki", rotation, by_node)
         own = rotation @ mean.by_own
         own = np.concatenate([own[:, :, :3], own[:, :, 3:12] @ SYMMETRIC, own[:, :, 12:]], axis=2)
-        equations.add(
-            "force", force - (v[node + 1] - v[node]) / length[:, None], sigma,
-            (here + ATTITUDE, -rotation @ skew(mean.value) + by_turn[node] / L), (there + ATTITUDE, -by_turn[node + 1] / L),
+        equations.add_measured(
+            "force", mean.value - true, sigma,
+            np.swapaxes(rotation, 1, 2), unpacked(x.errors).accelerometer_matrix, (self.errors_at + FORCE.start, SYMMETRIC),
+            (here + ATTITUDE, -rotation @ skew(true) + by_turn[node] / L), (there + ATTITUDE, -by_turn[node + 1] / L),
             (here + VELOCITY, unit / L), (there + VELOCITY, -unit / L),
             (here + LEVER, by_lever[node] / L), (there + LEVER, -by_lever[node + 1] / L),
             *self._by_errors(rotation @ mean.by_turn, own, BIAS.start),
@@ -272,10 +295,12 @@ class Problem:
         rotation, dip, unit = x.attitude[node], x.errors[DIP.start], np.eye(3)
         sigma = self.noise["field"] / np.sqrt(np.where(number > 0.0, number, np.finfo(float).tiny))
         d = x.nodes[:, DISTURBANCE - 3 : DISTURBANCE]
-        error = np.einsum("kij,kj->ki", rotation, mean.value) - [0.0, np.cos(dip), -np.sin(dip)]
-        equations.add(
-            "field", error - 0.5 * (d[node] + d[node + 1]), sigma,
-            (here + ATTITUDE, -rotation @ skew(mean.value)),
+        by_node = np.array([0.0, np.cos(dip), -np.sin(dip)]) + 0.5 * (d[node] + d[node + 1])
+        true = np.einsum("kji,kj->ki", rotation, by_node)
+        equations.add_measured(
+            "field", mean.value - true, sigma,
+            np.swapaxes(rotation, 1, 2), unpacked(x.errors).magnetometer_matrix, (self.errors_at + FIELD.start, np.eye(9)),
+            (here + ATTITUDE, -rotation @ skew(true)),
             (here + DISTURBANCE, -0.5 * unit), (there + DISTURBANCE, -0.5 * unit),
             (self.errors_at + DIP.start, np.array([[0.0], [np.sin(dip)], [np.cos(dip)]])),
             *self._by_errors(rotation @ mean.by_turn, rotation @ mean.by_own, IRON.start),
