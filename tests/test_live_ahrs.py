@@ -128,6 +128,7 @@ def test_it_starts_at_the_first_specific_force():
     [
         ((np.nan, (0, 0, 0), (0, 0, 9.8)), "time is nan s"),
         ((0.3, (0, 0, 0), (0, 0, 9.8)), "time is 0.3 s, not after the last sample"),
+        ((1.7e9, (0, 0, 0), (0, 0, 9.8)), r"time is 1.7e\+09 s, more than an hour after the last sample"),
         ((0.31, (0, np.nan, 0), (0, 0, 9.8)), "gyro has a NaN"),
         ((0.31, (0, 1e5, 0), (0, 0, 9.8)), r"give finite numbers, rates in rad/s"),
         ((0.31, (0, 0, 0), (0, 0, np.inf)), r"give finite numbers"),

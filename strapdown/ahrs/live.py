@@ -235,7 +235,8 @@ class LiveAhrs:
         Raises
         ------
         InputError
-            If the time is not after that of the last sample, or a number of the gyro is missing or infinite. The filter is then unchanged.
+            If the time is not after that of the last sample, or by more than an hour, or a number of the gyro is missing or infinite. The
+            filter is then unchanged.
         """
         call, name, sample = self._call, "time", time
         rate: Any = gyro
@@ -305,6 +306,7 @@ class LiveAhrs:
             {
                 kernel.NO_TIME: f"time is {time} s; give the time of the sample",
                 kernel.BEHIND: f"time is {time:.9g} s, not after the last sample; give samples in order",
+                kernel.AHEAD: f"time is {time:.9g} s, more than an hour after the last sample; start a new LiveAhrs if its clock jumped",
                 kernel.NO_GYRO: "gyro has a NaN; omit the sample",
                 kernel.INFINITE: f"gyro, accelerometer and magnetometer are {numbers}; give finite numbers, rates in rad/s",
                 kernel.TOO_FAST: f"the interval of the samples is far below {self.interval:g} s, their usual interval",

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import machine
+from strapdown.kernels import live_imu, machine
 from strapdown.kernels.algebra import dot, scale, square_root
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
 from strapdown.kernels.rotation import far_turn as far_turn_kernel
@@ -22,7 +22,7 @@ from strapdown.kernels.walk import turn_squared
 
 MAX_TURN = 100.0
 """Maximum rotation in one gyro sample, rad; it is divided into steps of a third of a radian."""
-MAX_INTERVAL = 3600.0
+MAX_INTERVAL = live_imu.MAX_INTERVAL
 """Maximum interval of a gyro sample, s."""
 MAX_VECTOR = 1e4
 """Maximum length of a measured whole vector over that of its reference."""

@@ -28,8 +28,10 @@ CHECK, START, SAMPLE = range(3)
 """What to do with a sample: check it, start at it, or take it."""
 RESTED = 1
 """Result: a step ended after a rest that shows the bias."""
-NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST = range(-25, -20)
+NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST, AHEAD = range(-26, -20)
 """Refusals."""
+MAX_INTERVAL = 3600.0
+"""Maximum interval between samples, s, over which the filter predicts step by step: of a clock that jumps it would take for hours."""
 
 MOST = -1
 """In a shape: the most samples of a step."""
@@ -184,8 +186,8 @@ def refusal(imu):
     a, started = imu.arrays, imu.arrays.count[0] > 0
     if not abs(imu.time[0]) < math.inf:
         return NO_TIME
-    if started and imu.time[0] <= a.clock[0]:
-        return BEHIND
+    if started and not a.clock[0] < imu.time[0] <= a.clock[0] + MAX_INTERVAL:
+        return BEHIND if imu.time[0] <= a.clock[0] else AHEAD
     for i in range(3):
         if math.isnan(imu.gyro[0, i]):
             return NO_GYRO
