@@ -42,6 +42,8 @@ _ROWS = ("time", *FIELDS.values())
 
 FEW_REPEATED = 0.01
 """Share of rows with the stamp of the row before, below which they are left out even if their samples differ."""
+LONGEST_GAP = 30.0 * 86400.0
+"""Maximum interval between samples, s. Longer ones are a clock that was set, and a filter would divide them into millions of steps."""
 LARGEST_RATE = 2000.0
 """Maximum rate, rad/s, five times the range of the fastest gyros. Larger values are raw counts or a damaged row, and a filter would divide
 each interval into thousands of steps."""
@@ -101,6 +103,12 @@ class Recording(Listed):
         """Check shapes, order and values."""
         time = increasing(f"{self.source}: time", self.time, minimum=2)
         n = len(time)
+        if time[-1] - time[0] > LONGEST_GAP and np.max(np.diff(time)) > LONGEST_GAP:
+            k = int(np.argmax(np.diff(time)))
+            raise InputError(
+                f"{self.source}: time[{k + 1}] jumps to {time[k + 1]:.9g} s after {time[k]:.9g} s, as if the clock was set; cut the "
+                "recording there"
+            )
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
         if np.max(np.abs(self.rate)) > LARGEST_RATE:
