@@ -41,8 +41,8 @@ BIAS_DRIFT = 3e-4
 """Least random walk of the gyro's bias between rests, rad/s/√s: that of the model with a magnetometer. Without one the filter's is smaller,
 so that acceleration is not treated as bias."""
 SLOW_DRIFT = 3e-5
-"""Random walk of the gyro's bias by which the smoother without a magnetometer follows all rests, rad/s/√s: 0.07 °/s in half an hour. With
-a larger one, slow turns that pass for rests would pass for drift."""
+"""Random walk of the gyro's bias by which the smoother without a magnetometer follows all rests, and beyond which a rest is a turn,
+rad/s/√s: 0.07 °/s in half an hour. With a larger one, slow turns would pass for rests or for drift."""
 VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
@@ -227,6 +227,7 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
         odds=TURN_ODDS**2,
         walk=walk,
         unmodelled=walk - modelled,
+        slow_walk=SLOW_DRIFT**2,
     )
 
 

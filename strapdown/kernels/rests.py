@@ -36,6 +36,8 @@ class Constants(NamedTuple):
     """Variance that the bias gains in a second between rests."""
     unmodelled: float
     """The part of it that the filter does not model."""
+    slow_walk: float
+    """The part of it that is not mistaken for a slow turn."""
 
 
 class Memory(NamedTuple):
@@ -142,8 +144,8 @@ def find_rest(constants, time, memory):
         spread += dot(off, off)
     variance = constants.own_variance + spread / parts
     since = time - memory.rest_clock[1]
-    drift = constants.walk * since
-    known, plausible = memory.bias_variance[0] + drift, memory.plausible_variance[0] + drift
+    known = memory.bias_variance[0] + constants.walk * since
+    plausible = memory.plausible_variance[0] + constants.slow_walk * since
     bias = vector_at(memory.rest_bias, 0)
     change = combine(1.0, rate, -1.0, bias)
     changed = dot(change, change) > constants.odds * (variance + plausible)
