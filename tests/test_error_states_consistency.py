@@ -115,7 +115,8 @@ def judged(
 
     Of an acceleration the package's simulator gives no truth, so it is left out of the error, and its own covariance with it.
     """
-    names = np.array([name.rpartition(" ")[0] for name in state_names(blocks)[0]])
+    groups = [name.rpartition(" ")[0] for name in state_names(blocks)[0]]
+    names = np.array([group.replace("misalignment", "scale") for group in groups])  # both are of one block
     parts = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names) if name != SWAY.name}
     parts["all"] = np.flatnonzero(names != SWAY.name)
     values: dict[str, list] = {name: [] for name in parts}
