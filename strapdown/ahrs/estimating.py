@@ -157,7 +157,7 @@ def estimate(
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
-    drift: Array | float = 0.0
+    drift = None
     if smooth:
         parameters = for_whole(used, parameters, at_rest)
         if used.magnetic_field is None and len(at_rest.last) > 1:  # the filter's bias hardly drifts
@@ -177,7 +177,7 @@ def estimate(
     at_stamps = _at_stamps(filtered, density, used, prepared, parameters, delays, options)
     return AhrsEstimate(
         recording=samples,
-        estimate=replace(at_stamps, bias=at_stamps.bias + drift),
+        estimate=at_stamps if drift is None else replace(at_stamps, bias=at_stamps.bias + drift),
         applied=calibration,
         record=prepared.record,
         initial=prepared.initial,
