@@ -5,14 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from measured import FIELD, HAND, beside_silent, drawn_start, state_errors
+from measured import FIELD, HAND, beside_silent, drawn_start, series_of, state_errors
 
 from strapdown import consistency, estimation, gyro, quaternion
 from strapdown.estimation import error_states
 from strapdown.estimation.observability import state_names
 from strapdown.estimation.states import ProcessNoise
 from strapdown.randomness import generator
-from strapdown.records import Truth
+from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import Accelerometer, Faults, Magnetometer
 
@@ -34,6 +34,8 @@ CASES = {
     "every kind": (SCALE, DRIFT, IRON, SWAY),
 }
 """The last has the structure of :data:`measured.EVERY_KIND`: its kernels are those of other tests, and the rest is slow."""
+GYRO_RATE = {"gyro scale": 200.0}
+"""Hz; at 50 Hz the rate that is taken as constant within an interval looks like a scale factor of half its σ after 40 s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +85,7 @@ def simulated(case: str, seed: int, run: int, duration: float) -> Run:
                 faults=Faults(correlated_sigma=0.4, correlation_time=1.0) if SWAY in blocks else Faults(),
             ),
         ),
-        rate=50.0,
+        rate=GYRO_RATE.get(case, 50.0),
         duration=duration,
     )
     record = simulate(scenario, seed, run)
@@ -115,8 +117,7 @@ def judged(
 
     Of an acceleration the package's simulator gives no truth, so it is left out of the error, and its own covariance with it.
     """
-    groups = [name.rpartition(" ")[0] for name in state_names(blocks)[0]]
-    names = np.array([group.replace("misalignment", "scale") for group in groups])  # both are of one block
+    names = np.array([name.rpartition(" ")[0] for name in state_names(blocks)[0]])
     parts = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names) if name != SWAY.name}
     parts["all"] = np.flatnonzero(names != SWAY.name)
     values: dict[str, list] = {name: [] for name in parts}
@@ -156,6 +157,23 @@ def test_the_covariance_is_consistent(smoothed):
 @pytest.mark.parametrize("case", CASES)
 def test_the_covariance_is_consistent_in_many_runs(case, smoothed):
     assert wrong(judged(case, CASES[case], 600, 40.0, smoothed=smoothed, seed=12)) == {}
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_a_rate_that_changes_within_an_interval_looks_like_a_scale_factor(share):
+    """Between samples an angle A sin Ωt is interpolated along its chord, which is smaller by ½ f (1 − f) (Ωh)²."""
+    step, frequency, amplitude = 0.02, 2.0 * np.pi * 0.8, 0.3
+    angle = lambda t: np.multiply.outer(amplitude * np.sin(frequency * t), [0.0, 0.0, 1.0])  # noqa: E731
+    edges = step * np.arange(2001)
+    time = edges[:-1:5] + share * step
+    star = quaternion.rotate(quaternion.exp(-angle(time)), [1.0, 0.0, 0.0])
+    series = series_of("star", "direction", time, star, [1.0, 0.0, 0.0], 1e-3)
+    record = ImuRecord(time=edges, increments=np.diff(angle(edges), axis=0), vectors=(series,))
+    initial = estimation.initial_state(np.array([1.0, 0.0, 0.0, 0.0]), attitude_sigma=0.01, bias_sigma=1e-3)
+    noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
+    block = error_states.GyroScale(scale_sigma=(0.0, 0.0, 0.01), misalignment_sigma=0.0)
+    scale = estimation.run(record, noise, initial, (block,)).error_states["gyro scale"].values[-1, 0]
+    assert scale == pytest.approx(-0.5 * share * (1.0 - share) * (frequency * step) ** 2, rel=0.05)
 
 
 @pytest.mark.parametrize(
