@@ -399,7 +399,7 @@ def test_the_sigma_of_the_start_says_how_it_moves():
         np.sqrt((3.0 * DEGREE) ** 2 + ((np.sin(DIP) * 3.0 * DEGREE) ** 2 + 0.1**2) / np.cos(DIP) ** 2), rel=0.01
     )
     turning = dataclasses.replace(plain, rate=plain.rate + np.array([2.0, 0.0, 0.0]))
-    assert np.sqrt(level @ begun(turning).covariance[:3, :3] @ level) == pytest.approx(0.2, rel=0.05)
+    assert np.sqrt(level @ begun(turning).covariance[:3, :3] @ level) == pytest.approx(0.6, rel=0.05)
     pushed = dataclasses.replace(plain, specific_force=1.3 * plain.specific_force)
     assert np.sqrt(level @ begun(pushed).covariance[:3, :3] @ level) == pytest.approx(0.3, rel=0.05)
 

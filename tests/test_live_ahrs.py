@@ -15,8 +15,8 @@ DRIFTING = replace(HAND_HELD_WITHOUT_MAGNETOMETER, rate_random_walk=1e-3)
 """A gyro whose bias is measured in nearly every second at rest."""
 
 
-def swinging(duration=20.0, interval=0.01, jitter=0.0) -> Recording:
-    """A unit at rest, then swung about all axes, then tilted slowly, which is no rest."""
+def swinging(duration=20.0, interval=0.01, jitter=0.0, shaken=0.0) -> Recording:
+    """A unit at rest, or shaken in x by an acceleration, m/s², for two seconds; then swung; then tilted slowly, which is no rest."""
     draw = generator(11, 0, "samples")
     time = 50.0 + interval * np.arange(round(duration / interval))
     time += jitter * draw.uniform(-0.5, 0.5, len(time))
@@ -27,9 +27,9 @@ def swinging(duration=20.0, interval=0.01, jitter=0.0) -> Recording:
     rate[since >= 0.7 * duration, 0] += np.radians(0.6)
     up = np.stack([0.5 * swing * np.sin(since), np.sin(tilt), np.cos(tilt)], axis=1)
     rate += np.array([2e-3, -1e-3, 5e-4]) + draw.normal(0.0, 1e-3, rate.shape)
-    return Recording(
-        source="swinging", time=time, rate=rate, specific_force=9.81 * up + draw.normal(0.0, 0.05, up.shape)
-    )
+    force = 9.81 * up + draw.normal(0.0, 0.05, up.shape)
+    force[:, 0] += np.where(since < 2.0, shaken * np.cos(15.0 * since), 0.0)
+    return Recording(source="swinging", time=time, rate=rate, specific_force=force)
 
 
 def with_missing(recording: Recording) -> Recording:
@@ -87,6 +87,20 @@ def test_a_magnetometer_with_iron_in_the_unit_and_a_disturbed_field():
     result = need_equal(replace(plain, magnetic_field=field))
     assert not np.any(result.delays.field)
     assert np.linalg.norm(result.hard_iron) > 1.0
+
+
+@pytest.mark.parametrize("magnetometer", [False, True])
+def test_a_start_in_motion_is_aligned_by_the_means_over_a_second(magnetometer):
+    """The first sample is tilted by 45°."""
+    shaken = with_missing(swinging(duration=8.0, shaken=10.0))
+    if magnetometer:
+        still = quaternion.conjugate(sensor_delays.gyro_attitude(shaken))
+        field = quaternion.rotate(still, [0.0, 20.0, -43.0]) + generator(12, 0, "field").normal(0.0, 0.3, (800, 3))
+        shaken = replace(shaken, magnetic_field=field)
+    result = need_equal(shaken)
+    tilt = quaternion.to_matrix(result.estimate.attitude)[:, 2, 2]
+    assert tilt[0] < 0.72
+    assert np.all(tilt[105:200] > np.cos(np.radians(20.0)))
 
 
 def test_stamps_that_jitter_and_a_known_delay():

@@ -15,7 +15,11 @@ from strapdown.ahrs import headings, regions
 from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
+    LARGE_TURN,
+    LAST_ALIGNMENT,
     Rests,
+    align,
+    alignments,
     drift_by_rests,
     first_vector,
     for_whole,
@@ -29,8 +33,8 @@ from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array, lengths, median
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
-from strapdown.estimation.states import changed
-from strapdown.kernels import recording_steps
+from strapdown.estimation.states import Change, changed
+from strapdown.kernels import alignment, recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.recordings.sensor_delays import Delays
@@ -230,13 +234,16 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
     blocks = error_states(parameters, *((series.sensor, series.kind) for series in record.vectors))
     added = uncertain_turns(prepared.turn_variance)
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
+    aligned = {} if smooth else _alignments(prepared, added, parameters)
 
     def change(edge: int, x: Array, P: Array) -> None:
         for k in np.flatnonzero(rested == edge):
             take_rate_at_rest(x, P, at_rest.rate[k], float(at_rest.sigma[k]), float(at_rest.gained[k]))
+        if edge in aligned:
+            aligned[edge](x, P)
         P[[0, 1, 2], [0, 1, 2]] += added[edge]
 
-    bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()
+    bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, *aligned, len(record.increments)]).tolist()
     state = changed(prepared.initial, functools.partial(change, 0))
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
@@ -259,6 +266,29 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
             state = changed(state, functools.partial(change, last))
     return joined(parts)
+
+
+def _alignments(prepared: Prepared, added: Array, parameters: AhrsParameters) -> dict[int, Change]:
+    """Return the changes of the state by coarse alignment, by edge of the steps: from the start on, and after large uncertain rotations."""
+    time = prepared.record.time
+    changes: dict[int, Change] = {}
+    for first in [0, *(1 + np.flatnonzero(added.max(axis=1) > LARGE_TURN**2))]:
+        rows = slice(first, int(np.searchsorted(time, time[first] + 2.0 * LAST_ALIGNMENT)))
+        steps = alignment.Steps(*(column[rows] for column in prepared.steps))
+        aligned = alignments(steps, prepared.interval, parameters, afresh=first == 0)
+        for k in np.flatnonzero(aligned.variance > 0.0):
+            field = aligned.field[k]
+            if first and prepared.field is not None and field.any():
+                field = field - prepared.field.iron[first - 1]
+            changes[first + 1 + int(k)] = functools.partial(
+                align,
+                force=aligned.force[k],
+                field=field,
+                tilt=float(aligned.variance[k]),
+                parameters=parameters,
+                afresh=first == 0,
+            )
+    return changes
 
 
 def uncertain_turns(variance: Array) -> Array:

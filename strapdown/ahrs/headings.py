@@ -15,7 +15,7 @@ from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, lengths, median
 from strapdown.kernels import headings as kernel
-from strapdown.kernels.first_state import iron_variance, sine_of_dip
+from strapdown.kernels.alignment import iron_variance, sine_of_dip
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import hard_iron
 from strapdown.recordings.hard_iron import low_pass

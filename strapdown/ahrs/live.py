@@ -18,6 +18,8 @@ from strapdown.estimation import live as estimation_live
 from strapdown.estimation.forward import TooPreciseError
 from strapdown.estimation.live import change, restart
 from strapdown.kernels import live_imu as kernel
+from strapdown.kernels.alignment import Outputs as Aligned
+from strapdown.kernels.alignment import Steps as Alignable
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.live import TOO_PRECISE
 from strapdown.kernels.machine import address_of, compiled, read_only
@@ -169,6 +171,7 @@ class LiveAhrs:
             for name, (shape, kind, _) in (kernel.LASTING | kernel.PASSING).items()
         }
         arrays: Any = kernel.Arrays(**{name: np.zeros(shape, kind) for name, (shape, kind) in shapes.items()})
+        arrays.alignment[:] = starting.alignment_memory()
         arrays.force_density[0] = regions.FIRST_DENSITY[0]
         arrays.field_density[0] = regions.FIRST_DENSITY[0] if magnetometer else 1.0
         arrays.force_averages[:] = regions.first_memory(2, step)
@@ -191,6 +194,12 @@ class LiveAhrs:
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
             end=(r(a.frame), a.edge, a.total, a.number, a.mean, a.turn),
+            align=(
+                starting.alignment_constants(self.interval, parameters),
+                Alignable(*map(r, (a.total, a.number, a.field_total[: self.magnetometer], a.field_number, a.end))),
+                a.alignment,
+                Aligned(a.aligned_force, a.aligned_field, a.aligned_variance),
+            ),
             judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
             scale=(r(a.force_density), r(a.field_density), scales, a.tilt, a.heading),
             carry=(
@@ -267,12 +276,18 @@ class LiveAhrs:
         code = self._take(self._kind, self._table, kernel.SAMPLE)
         if code < 0:
             self._refuse(code)
-        if code == kernel.RESTED:
+        if code & kernel.RESTED:
             rests = self._rests
             rate, sigma, gained = rests.rest_rate[0], math.sqrt(rests.rest_variance[0]), float(rests.rest_gained[0])
             measured = {"rate": rate, "sigma": sigma, "gained": gained}
             change(self._filter, functools.partial(starting.take_rate_at_rest, **measured))
             self._imu.resting[1] = 0
+        if code & kernel.ALIGNED:
+            arrays = self._imu.arrays
+            force, field, tilt = arrays.aligned_force[0], arrays.aligned_field[0], float(arrays.aligned_variance[0])
+            mean = {"force": force, "field": field, "tilt": tilt, "parameters": self.parameters}
+            change(self._filter, functools.partial(starting.align, **mean, afresh=True))
+            arrays.aligned_variance[0] = 0.0
 
     def _begin(self) -> None:
         """Start at the sample in the call, if it has a specific force and, with a magnetometer, a field."""

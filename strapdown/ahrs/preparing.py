@@ -12,8 +12,8 @@ from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.gyro.temperature import BiasOverTemperature
+from strapdown.kernels import alignment, recording_steps
 from strapdown.kernels import headings as kernel
-from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
@@ -39,6 +39,10 @@ class Prepared(NamedTuple):
     """Variance of the rotation about each body axis over each step in addition to the gyro's noise, rad² (k, 3)."""
     skipped: dict[str, int]
     """Number of the gyro's samples without one of each other sensor."""
+    interval: float
+    """Usual interval of the samples, s."""
+    steps: alignment.Steps
+    """Samples of the steps for coarse alignments."""
     field: headings.Headings | None
     """What was found of the field; None without a magnetometer."""
 
@@ -84,22 +88,24 @@ def prepare(
     ]
     skipped = {"accelerometer": missing(recording.specific_force, number)}
     heading = None
+    field, counted = np.empty((0, 3)), np.empty(0)
     if recording.magnetic_field is not None:
         variance = added.copy()
         variance[1:] += added[:-1]  # most of a step's samples may precede the uncertain rotation
         field, counted, middle = field_sums(recording, field_delay, turned, edge)
         bias = starting.bias_by_rests(at_rest, recording.time, edge, causal=causal)
-        steps = kernel.Steps(
+        of_field = kernel.Steps(
             field, counted, counted * interval, middle, total, number, turned[edge[1:]], time[1:], variance, bias
         )
         skipped["magnetometer"] = missing(recording.magnetic_field, counted)
         headings_by = headings.online if causal else headings.smoothed
-        heading = headings_by(steps, float(time[0]), parameters, max(parameters.step, interval))
+        heading = headings_by(of_field, float(time[0]), parameters, max(parameters.step, interval))
         vectors.append(heading.vectors)
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, added, skipped, heading)
+    steps = alignment.Steps(total, number, field, counted, turned[edge[1:]])
+    return Prepared(record, initial, edge, turned, added, skipped, interval, steps, heading)
 
 
 def field_sums(

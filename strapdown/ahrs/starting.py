@@ -13,7 +13,7 @@ from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
 from strapdown.estimation.states import changed
-from strapdown.kernels import first_state, recording_samples
+from strapdown.kernels import alignment, recording_samples
 from strapdown.kernels import rests as kernel
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.rotation import moved, unit
@@ -33,7 +33,17 @@ TURN_ODDS = 5.0
 """Difference of a mean rate from the bias by the rests before, relative to its σ, above which it is a turn."""
 FIRST_BIAS_SIGMA = 2.0 * DEGREE
 """Its σ before the first rest, rad/s, without a magnetometer too."""
-SWING_TIME = 0.1
+FIRST_ALIGNMENT, LAST_ALIGNMENT = 0.0625, 1.0
+"""Durations of the first and of the last coarse alignment, s."""
+MIN_MOTION = 0.3
+"""Variation of the specific force, in g, from which on a unit that starts is aligned coarsely; with less the filter corrects itself."""
+CHANGE_TIME = 0.35
+"""Duration over which an acceleration has one direction, s: σ of the mean vertical is the variation, in g, times this over the duration.
+By 500 starts in motion in 27 recordings of all eight sets; without coarse alignment 6 % of them were still wrong by more than 3 σ after 5 s
+without a magnetometer."""
+LARGE_TURN = 0.5
+"""σ of an uncertain rotation about an axis, rad, above which the attitude after it is aligned coarsely."""
+SWING_TIME = 0.3
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
@@ -138,22 +148,83 @@ def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> es
     """
     assert recording.specific_force is not None
     force = first_vector(recording.specific_force, turned, recording.source, "accelerometer")
-    across = np.array(first_state.least_axis(force.tolist()))
+    across, heading = np.array(alignment.least_axis(force.tolist())), 0.0
+    constants = start_constants(parameters)
+    tilt = alignment.tilt_variance(constants, force.tolist(), recording.rate[0].tolist())
     if recording.magnetic_field is not None:
         across = first_vector(recording.magnetic_field, turned, recording.source, "magnetometer")
-    attitude, constants = wahba.from_vertical_and_heading(force, across), start_constants(parameters)
-    tilt = first_state.tilt_variance(constants, force.tolist(), recording.rate[0].tolist())
-    P = np.diag(np.repeat([tilt, parameters.bias_sigma**2], 3))
-    if recording.magnetic_field is not None:
-        up = force / np.linalg.norm(force)
-        sine = first_state.sine_of_dip(force.tolist(), across.tolist())
-        P[:3, :3] += np.outer(up, up) * first_state.heading_variance(constants, sine, tilt)
+        sine = alignment.sine_of_dip(force.tolist(), across.tolist())
+        heading = alignment.heading_variance(constants, sine, tilt)
+    attitude, P = wahba.from_vertical_and_heading(force, across), np.eye(6) * parameters.bias_sigma**2
+    P[:3, :3] = attitude_covariance(force, tilt, heading)
     return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
 
 
-def start_constants(parameters: AhrsParameters) -> first_state.Constants:
+def attitude_covariance(force: Array, tilt: float, heading: float) -> Array:
+    """Return the covariance (3, 3), rad², of an attitude whose vertical is that of a specific force (3,), from variances.
+
+    ``heading``: variance of the heading in addition to that by the tilt.
+    """
+    up = force / np.linalg.norm(force)
+    return np.asarray(tilt * np.eye(3) + heading * np.outer(up, up))
+
+
+def align(
+    x: Array, P: Array, force: Array, field: Array, tilt: float, parameters: AhrsParameters, *, afresh: bool
+) -> None:
+    """Replace the attitude in a state x (n + 1,) and its covariance by that of mean specific force and field (3,), body axes.
+
+    ``tilt``: variance of the tilt, rad². ``afresh``: from the first sample on, where an attitude that agrees remains. After a gap the
+    heading remains without a field (zero), and if it is more certain than that of the field.
+    """
+    constants, up = start_constants(parameters), force / np.linalg.norm(force)
+    if afresh and not alignment.departs(x[:4].tolist(), force.tolist(), tilt):
+        return
+    if not afresh and field.any():
+        sine = alignment.sine_of_dip(force.tolist(), field.tolist())
+        if alignment.heading_variance(constants, sine, tilt) > up @ P[:3, :3] @ up:
+            field = np.zeros(3)
+    present = P[np.triu_indices(3)].tolist()
+    x[:4], heading = alignment.aligned(constants, force.tolist(), field.tolist(), tilt, x[:4].tolist(), present)
+    P[:3], P[:, :3] = 0.0, 0.0
+    P[:3, :3] = attitude_covariance(force, tilt, heading)
+
+
+def alignment_constants(interval: float, parameters: AhrsParameters, *, afresh: bool = True) -> alignment.Constants:
+    """Return the constants of the coarse alignment at this interval of the samples, s; ``afresh``: from the first sample on."""
+    return alignment.Constants(
+        interval=interval,
+        first=FIRST_ALIGNMENT,
+        last=LAST_ALIGNMENT,
+        min_motion=MIN_MOTION**2 if afresh else 0.0,
+        change_time=CHANGE_TIME,
+        known=parameters.attitude_sigma**2,
+        unknown=MAX_TILT_SIGMA**2,
+        gravity=STANDARD_GRAVITY,
+    )
+
+
+def alignment_memory(*, afresh: bool = True) -> Array:
+    """Return the memory of the coarse alignment before the first step; after a gap the first step already shows more than is known."""
+    memory = np.zeros(alignment.SIZE)
+    memory[alignment.DUE] = FIRST_ALIGNMENT if afresh else 0.0
+    return memory
+
+
+def alignments(
+    steps: alignment.Steps, interval: float, parameters: AhrsParameters, *, afresh: bool
+) -> alignment.Outputs:
+    """Return the coarse alignments over steps; ``interval``: that of the samples, s; ``afresh``: from the first sample on."""
+    k = len(steps.force)
+    out = alignment.Outputs(np.zeros((k, 3)), np.zeros((k, 3)), np.empty(k))
+    constants, memory = alignment_constants(interval, parameters, afresh=afresh), alignment_memory(afresh=afresh)
+    compiled(alignment.align_steps)(constants, alignment.Steps(*map(read_only, steps)), memory, out)
+    return out
+
+
+def start_constants(parameters: AhrsParameters) -> alignment.FirstConstants:
     """Return the constants of the variances at the start."""
-    return first_state.Constants(
+    return alignment.FirstConstants(
         attitude_sigma=parameters.attitude_sigma,
         max_tilt_sigma=MAX_TILT_SIGMA,
         swing_time=SWING_TIME,

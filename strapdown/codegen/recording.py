@@ -19,7 +19,7 @@ import numpy as np
 from strapdown.ahrs import regions, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.codegen import program as body
-from strapdown.kernels import first_state, headings, live_imu, rests
+from strapdown.kernels import alignment, headings, live_imu, rests
 from strapdown.kernels.algebra import dot
 from strapdown.kernels.live_imu import Imu
 from strapdown.kernels.rotation import unit
@@ -153,6 +153,9 @@ def init(f: Any) -> Any:
     for i in range(6):
         f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
+    for i, value in enumerate(starting.alignment_memory().tolist()):
+        f.alignment[i] = value
+    f.aligned_variance[0] = 0.0
     judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
     if r.imu.magnetometer:
         judged.append((f.field_density, f.field_averages, r.imu.arrays.field_averages))
@@ -218,29 +221,49 @@ def begin(f: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any) -
         return body.NOT_STARTED
     sine, heading, iron, across = 0.0, 0.0, 0.0, magnetometer
     constants = starting.start_constants(parameters)
-    tilt = first_state.tilt_variance(constants, accelerometer, gyro)
+    tilt = alignment.tilt_variance(constants, accelerometer, gyro)
     if imu.magnetometer:
         if not dot(magnetometer, magnetometer) > 0.0:
             return body.NOT_STARTED
-        sine = first_state.sine_of_dip(accelerometer, magnetometer)
+        sine = alignment.sine_of_dip(accelerometer, magnetometer)
         if not 1.0 - sine * sine > MIN_HORIZONTAL_SQUARED:
             return body.NO_HEADING
-        heading = first_state.heading_variance(constants, sine, tilt)
-        iron = first_state.iron_variance(parameters.first_iron_sigma, sine)
+        heading = alignment.heading_variance(constants, sine, tilt)
+        iron = alignment.iron_variance(parameters.first_iron_sigma, sine)
     else:
-        across = first_state.least_axis(accelerometer)
-    q, up = first_state.first_attitude(accelerometer, across), first_state.direction(accelerometer)
-    for i in range(4):
-        f.x[i] = q[i]
-    for i in range(3):
-        for j in range(i, 3):
-            f.P[body.place(f.program.n, i, j)] = up[i] * up[j] * heading + (tilt if i == j else 0.0)
+        across = alignment.least_axis(accelerometer)
+    put_attitude(f, alignment.first_attitude(accelerometer, across), heading, accelerometer, tilt)
     f.iron_variance[0] = iron
     if imu.rests:
         f.rest_clock[1] = time
     put_sample(imu, time, gyro, accelerometer, magnetometer)
     live_imu.start(imu)
     return body.OK
+
+
+def put_attitude(f: Any, q: Any, heading: Any, force: Any, tilt: Any) -> None:
+    """Write an attitude, and its covariance as strapdown.ahrs.starting.attitude_covariance."""
+    up = alignment.direction(force)
+    for i in range(4):
+        f.x[i] = q[i]
+    for i in range(3):
+        for j in range(i, 3):
+            f.P[body.place(f.program.n, i, j)] = up[i] * up[j] * heading + (tilt if i == j else 0.0)
+
+
+def use_alignment(f: Any) -> None:
+    """Replace the attitude by that of a coarse alignment: as strapdown.ahrs.starting.align."""
+    n, tilt, q = f.program.n, f.aligned_variance[0], tuple(f.x[i] for i in range(4))
+    force, field = (tuple(a[0, i] for i in range(3)) for a in (f.aligned_force, f.aligned_field))
+    if alignment.departs(q, force, tilt):
+        covariance = tuple(f.P[body.place(n, i, j)] for i in range(3) for j in range(i, 3))
+        constants = starting.start_constants(f.program.recording.parameters)
+        mean, heading = alignment.aligned(constants, force, field, tilt, q, covariance)
+        put_attitude(f, mean, heading, force, tilt)
+        for i in range(3):
+            for j in range(3, n):
+                f.P[body.place(n, i, j)] = 0.0
+    f.aligned_variance[0] = 0.0
 
 
 # ------------------------------------------------------------------------------------- in place of functions of the filter in Python
@@ -269,6 +292,8 @@ def end_step(imu: Any) -> None:
     """Filter a step: its rotation, the mean of its samples, and a heading that ends with it."""
     if imu.rests > 0 and imu.resting[1] == 2:
         use_rest(imu.filter)
+    if imu.arrays.aligned_variance[0] > 0.0:
+        use_alignment(imu.filter)
     if imu.magnetometer > 0:
         for i in range(3):
             imu.arrays.found_direction[0, i] = 0.0

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from strapdown.kernels.alignment import SIZE, align_steps
 from strapdown.kernels.argument_tables import call, unpacked
 from strapdown.kernels.headings import heading_steps
 from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
@@ -26,8 +27,8 @@ from strapdown.kernels.rests import find_rests
 
 CHECK, START, SAMPLE = range(3)
 """What to do with a sample: check it, start at it, or take it."""
-RESTED = 1
-"""Result: a step ended after a rest that shows the bias."""
+RESTED, ALIGNED = 1, 2
+"""Results, which may be added: a step ended after a rest that shows the bias, or with a coarse alignment."""
 NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST, AHEAD = range(-26, -20)
 """Refusals."""
 MAX_INTERVAL = 3600.0
@@ -50,6 +51,14 @@ LASTING = {
     "field_innovation": ((1, 1), "", "last innovation of the heading over its sigma"),
     "field_density": ((1,), "", "density of the heading's innovations at low frequency; 1 without a magnetometer"),
     "field_averages": ((4,), "", "its averages and sums"),
+    "alignment": (
+        (SIZE,),
+        "",
+        "of the coarse alignment: when it is due, s; numbers and sums of specific force and field",
+    ),
+    "aligned_force": ((1, 3), "", "mean specific force by which the attitude is aligned"),
+    "aligned_field": ((1, 3), "", "mean field, zero without one"),
+    "aligned_variance": ((1,), "", "variance of its tilt, rad^2; 0: it is not aligned"),
     "clock": ((3,), "wide", "time of the last sample, of the start of the step, of the first sample, s"),
     "count": ((2,), "int", "whether the filter has started; samples in the step"),
 }
@@ -98,6 +107,7 @@ class Routines(NamedTuple):
     follow: Any
     average: Any
     end: Any
+    align: Any
     judge: Any
     scale: Any
     carry: Any
@@ -111,6 +121,7 @@ KERNELS = Routines(
     follow=follow_gyro,
     average=average_samples,
     end=end_steps,
+    align=align_steps,
     judge=innovation_density,
     scale=scale_factors,
     carry=carry_to_stamps,
@@ -165,7 +176,7 @@ class Imu(NamedTuple):
 
 
 def take(kind, table, task):
-    """Process a sample; return ``RESTED`` or 0, or a refusal, which leaves everything as it was."""
+    """Process a sample; return ``RESTED`` plus ``ALIGNED``, either or 0, or a refusal, which leaves everything as it was."""
     imu = unpacked(kind, table)
     if task != START:
         code = refusal(imu)
@@ -178,7 +189,7 @@ def take(kind, table, task):
         take_sample(imu)
     if imu.refused[0] < 0:
         return imu.refused[0]
-    return RESTED if imu.resting[1] == 2 else 0
+    return (RESTED if imu.resting[1] == 2 else 0) + (ALIGNED if imu.arrays.aligned_variance[0] > 0.0 else 0)
 
 
 def refusal(imu):
@@ -267,6 +278,9 @@ def end_step(imu):
         call(routines.judge.address, routines.judge.arguments, ())
     if imu.magnetometer > 0:
         end_field(imu)
+    for i in range(4):
+        a.end[0, i] = a.turned[i]
+    call(routines.align.address, routines.align.arguments, ())
     begin_step(imu)
 
 

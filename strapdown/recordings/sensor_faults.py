@@ -54,6 +54,8 @@ STRAIGHT = 1e-4
 """Maximum second difference of such samples, relative to the median one of the recording."""
 UNKNOWN_TURN = 1.0
 """Maximum variance of a rotation over a gap filled by interpolation, rad² per axis."""
+LEAD = 0.05
+"""Time before such a gap whose samples are left out too, s, so that no step of the filter has some from before an unknown rotation."""
 LONG_INTERVAL = 1.5
 """Ratio of an interval between stamps to the median interval above which its rotation is uncertain."""
 MAX_SAMPLING_ERROR = 8e-3
@@ -115,9 +117,11 @@ def find(recording: Recording) -> Faults:
     if filled:
         lengths = np.array([recording.time[last] - recording.time[first] for first, last in filled])
         turns = np.minimum(turn_variance_over(rate, lengths, usual), UNKNOWN_TURN)
-        for (first, _), turn in zip(filled, turns, strict=True):
+        for (first, last), turn in zip(filled, turns, strict=True):
             variance[first] += turn
-        inside = np.concatenate([np.arange(first + 1, last) for first, last in filled])
+            variance[last - 1] += 0.5 * turn  # so that what is after the gap shows nothing of what is within
+        lead = round(LEAD / usual)
+        inside = np.concatenate([np.arange(max(first + 1 - lead, 0), last) for first, last in filled])
         for name in ("specific_force", "magnetic_field"):
             samples = changes.get(name, getattr(recording, name))
             if samples is not None:
@@ -263,10 +267,11 @@ def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
     """Return the variance (m,), rad² per axis, of rotations computed from the rates at the ends of intervals of duration T, s (m,).
 
     With D the mean square change of the rate over T in the rest of the recording, and the rate between both ends modelled as a Brownian
-    bridge, the variance is ``T² D/12``.
+    bridge, the variance is ``T² D/12``. D is the largest of those over T, half and a quarter of it: over a period of a swing there is none.
     """
     lags, place = np.unique(np.clip(np.rint(length / usual).astype(int), 1, len(rate) - 1), return_inverse=True)
-    change = np.array([np.mean((rate[lag:] - rate[:-lag]) ** 2) for lag in lags])
+    parts = [{lag, (lag + 1) // 2, (lag + 3) // 4} for lag in lags.tolist()]
+    change = np.array([max(np.mean((rate[lag:] - rate[:-lag]) ** 2) for lag in some) for some in parts])
     return np.asarray(length**2 / 12.0 * change[place])
 
 

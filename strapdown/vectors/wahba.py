@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, place
-from strapdown.kernels.first_state import first_attitude
+from strapdown.kernels.alignment import first_attitude
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
