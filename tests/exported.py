@@ -86,6 +86,7 @@ class Plain:
         self.f = f = SimpleNamespace(
             program=program,
             kernels=PlainModule(program.kernels, replaced, self.called),
+            prediction=PlainModule(program.prediction, replaced, self.called),
             x=[0.0] * (n + 1),
             P=[0.0] * program.number_of_covariances,
             nis=[0.0] * len(program.sensors),

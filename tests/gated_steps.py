@@ -21,7 +21,8 @@ from strapdown.estimation.forward import aged_states, gate_events, in_order, las
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.kernels import filter, gate_rules, iterated_update, machine
+from strapdown.kernels import gate_rules, iterated_update, machine
+from strapdown.kernels import rows as row_kernels
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
@@ -370,7 +371,7 @@ class GatedStepFilter(StepFilter):
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
-        kernels = machine.instance(filter, STRUCTURE=model.structure)
+        kernels = machine.instance(row_kernels, STRUCTURE=model.structure)
         x, iterated = np.concatenate([attitude, others]), self._passes > 1
         H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measurement, model.numbers, 0.0, iterated)
         y, basis, sine = np.array(y), np.array(axes), math.sqrt(squared)

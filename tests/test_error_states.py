@@ -35,7 +35,8 @@ from strapdown.estimation.observability import state_names, without_errors
 from strapdown.estimation.states import ProcessNoise, changed
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import machine, six_states, smoother, structure
+from strapdown.kernels import layout, machine, six_states, smoother, structure, update
+from strapdown.kernels import rows as row_kernels
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.vectors import triad
@@ -338,7 +339,7 @@ def test_rows_are_the_derivative_of_what_sensors_give(option, transverse):
 def rows_at(face, sensor, kind, reference, z, transverse):
     """Return H and y that the kernel makes of a measurement at the face's estimate."""
     model = face._model(sensor, kind)
-    kernels = machine.instance(filter_kernels, STRUCTURE=model.structure)
+    kernels = machine.instance(row_kernels, STRUCTURE=model.structure)
     length = np.linalg.norm(reference) if kind == "vector" else 1.0
     attitude = kind == "attitude"
     frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
@@ -355,10 +356,12 @@ def rows_at(face, sensor, kind, reference, z, transverse):
 def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bound):
     """Predictions and rows of random directions in nine states over nine decades, against 60 digits."""
     rng = np.random.default_rng(7)
-    kernels = machine.instance(filter_kernels, STRUCTURE=structure.SIX_STATES._replace(n=9))
-    n, W, LINE, ROWS = kernels.N, kernels.W, kernels.LINE, kernels.ROWS
+    sizes, kernels = (
+        machine.instance(module, STRUCTURE=structure.SIX_STATES._replace(n=9)) for module in (layout, update)
+    )
+    n, W, LINE, ROWS = sizes.N, sizes.W, sizes.LINE, sizes.ROWS
     prior = np.geomspace(1e-5, 1e5, n)[rng.permutation(n)]
-    P, work = np.zeros((n, W)), np.zeros((kernels.LINES, LINE))
+    P, work = np.zeros((n, W)), np.zeros((sizes.LINES, LINE))
     P[:, :n] = np.diag(prior**2)
     clear_step, take_row = called(kernels.clear_step), called(kernels.take_row)
     with mpmath.workdps(60):
@@ -387,7 +390,7 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
                     K = exact_P * h.T / exact
                     x = x + K * (y[r] - (h * x)[0])
                     exact_P = exact_P - K * (h * exact_P)
-                step = work[kernels.STEP]
+                step = work[sizes.STEP]
                 assert max(abs(step[i] - x[i]) / mpmath.sqrt(exact_P[i, i]) for i in range(n)) < bound
         expected = np.array(exact_P.tolist(), np.float64)
     sigma = np.sqrt(np.diag(expected))
@@ -704,13 +707,11 @@ def test_the_kernels_are_compiled_once_for_a_structure():
         model = forward.prepared(record, NOISE, start(), blocks).model
         assert model.structure == forward.prepared(record, NOISE, start(), others).model.structure
         estimation.smooth(record, NOISE, start(), blocks)
-        kernels = forward.instance_of(model) if blocks else six_states
+        kernels = forward.instance_of(model, filter_kernels) if blocks else six_states
         dispatchers = [machine.compiled(walk, kernels)]
         if blocks:
             without = model.structure._replace(sensors=())  # of the smoother
-            dispatchers.append(
-                machine.compiled(smoother.smooth_back, machine.instance(filter_kernels, STRUCTURE=without))
-            )
+            dispatchers.append(machine.compiled(machine.instance(smoother, STRUCTURE=without).smooth_back))
         compiled = [list(dispatcher.signatures) for dispatcher in dispatchers]
         estimation.smooth(_laid_out_otherwise(record), NOISE, start(), others)
         assert [dispatcher.signatures for dispatcher in dispatchers] == compiled

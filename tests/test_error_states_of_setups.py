@@ -28,6 +28,7 @@ from strapdown.estimation.setup import states as optional
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
+from strapdown.kernels import rows as row_kernels
 from strapdown.kernels import structure
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
@@ -270,7 +271,7 @@ def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
     x, upper = np.concatenate([np.zeros(7), arm]), np.triu_indices(3)
     C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
     measured = structure.Measured((), (), (), length, (0.0,) * 6 + tuple(variance))
-    kernels = forward.instance_of(model)
+    kernels = forward.instance_of(model, row_kernels)
     noise = kernels.arm_noise(0, x, measured, tuple(C[upper]), model.numbers, 0.0)
     r = kinematics.skew(arm / length)
     np.testing.assert_allclose(noise, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
@@ -283,7 +284,7 @@ def test_an_accelerometer_at_an_arm_feels_the_turning_body(kind):
     q, up = quaternion.exp([0.3, -0.4, 1.2]), np.array([0.0, 0.0, 9.81])
     strength = 1.0 if kind == "vector" else 9.81
     model = assemble((error_states.LeverArm(sensor="acc", arm_sigma=0.3, strength=strength),), {"acc": kind})
-    kernels, length = forward.instance_of(model), 9.81 if kind == "vector" else 1.0
+    kernels, length = forward.instance_of(model, row_kernels), 9.81 if kind == "vector" else 1.0
 
     def felt(r):
         return in_body(q, up) + np.cross(turning, r) + np.cross(rate, np.cross(rate, r))

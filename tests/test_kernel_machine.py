@@ -30,6 +30,8 @@ from strapdown.kernels import (
     algebra,
     analysis,
     gate,
+    gated_update,
+    layout,
     likelihood,
     likelihood_outliers,
     machine,
@@ -37,6 +39,7 @@ from strapdown.kernels import (
     montecarlo_run,
     montecarlo_six,
     six_states,
+    update,
 )
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels.lane_values import WIDTH
@@ -199,19 +202,24 @@ def test_a_missing_definition_is_refused_by_its_name():
 
 
 SENSORS = {"star": "direction", "field": "vector", "compass": "heading", "tracker": "attitude"}
-FILTER, SEVERAL, OWN = (
-    machine.instance(filter_kernels, STRUCTURE=assemble((), SENSORS).structure, **lanes)
-    for lanes in ({}, {"LANES": WIDTH}, {"LANES": WIDTH, "PARAMETERS": True})
-)
+STRUCTURE = assemble((), SENSORS).structure
+SEVERAL: dict[str, Any] = {"LANES": WIDTH}
+OWN = {"LANES": WIDTH, "PARAMETERS": True}
+
+
+def instance(module: ModuleType, **lanes: Any) -> ModuleType:
+    return machine.instance(module, STRUCTURE=STRUCTURE, **lanes)
+
+
 BODIES = [
     (six_states,),
-    (FILTER,),
-    (gate, FILTER),
-    (analysis, FILTER),
-    (montecarlo_run, montecarlo_filter, SEVERAL),
+    (instance(filter_kernels),),
+    (instance(gate),),
+    (instance(analysis),),
+    (montecarlo_run, instance(montecarlo_filter, **SEVERAL)),
     (montecarlo_run, montecarlo_six),
-    (likelihood, OWN),
-    (likelihood_outliers, likelihood, OWN),
+    (instance(likelihood, **OWN),),
+    (instance(likelihood_outliers, **OWN), instance(likelihood, **OWN)),
 ]
 """What the walk is compiled with."""
 
@@ -232,9 +240,10 @@ def parts_used() -> set[tuple[str, ...]]:
 def test_every_body_of_the_walk_is_listed_here():
     assert parts_used() == {
         ("six_states",),
-        ("gate", "kernels"),
-        ("analysis", "kernels"),
-        ("montecarlo_run", "*prepared.parts"),
+        ("instance_of(model, filter_kernels)",),
+        ("instance_of(model, gate)",),
+        ("forward.instance_of(problem.model, analysis)",),
+        ("montecarlo_run", "prepared.filter"),
         ("kernels",),
         ("*bodies",),
     }
@@ -256,13 +265,17 @@ def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts)
             assert defined[0].__doc__
 
 
-def test_an_instance_defines_what_others_import_from_its_module():
-    """Not that of another module, and not without it."""
-    judge = filter_kernels.judge
-    for parts, definition in (((gate, FILTER), FILTER.judge), ((six_states, OWN, FILTER), OWN.judge), ((gate,), judge)):
-        assert machine._defined("judge", judge, gate.update, parts) is definition
-        assert machine._depends_on_parts(gate.update, parts) == (definition is not judge)
-    assert machine._defined("robust_weight", gate.robust_weight, gate.update, (gate, FILTER)) is gate.robust_weight
+def test_an_instance_imports_copies_of_templates_with_its_constants_and_all_else_as_it_is():
+    gated, several, plain = instance(gate), instance(likelihood, **SEVERAL), instance(likelihood)
+    assert instance(gate) is gated
+    assert gated.update is not gate.update
+    assert gated.judge is instance(gated_update).judge is not gated_update.judge
+    assert gated.judge.__globals__["apply_gains"] is instance(update).apply_gains
+    assert (several.take, plain.take) == (instance(update, **SEVERAL).take, instance(update).take)
+    assert instance(update, **SEVERAL).LANES == instance(layout, **SEVERAL).LANES == WIDTH
+    assert (layout.N, instance(layout).STRUCTURE, update.STRUCTURE.n) == (6, STRUCTURE, 6)
+    for name in ("judge_filter", "degrees_of_freedom", "Filter"):
+        assert getattr(gated, name) is getattr(gate, name)
 
 
 def test_a_literal_argument_compiles_no_helper_twice():

@@ -13,8 +13,7 @@ from strapdown.estimation import forward, gating
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import gate_rules, machine, structure
+from strapdown.kernels import gate_rules, layout, machine, restart_candidate, structure
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -346,7 +345,9 @@ def test_a_refused_update_that_does_not_converge_is_reported_at_the_prior(kind, 
 
 def test_a_widened_candidate_is_one_that_started_wider():
     """Of the information of all its measurements, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
-    kernels = machine.instance(filter_kernels, STRUCTURE=structure.SIX_STATES)
+    kernels, sizes = (
+        machine.instance(module, STRUCTURE=structure.SIX_STATES) for module in (restart_candidate, layout)
+    )
     rng = np.random.default_rng(3)
     for _ in range(20):
         variance = rng.uniform(0.5, 2.0, 3)
@@ -354,9 +355,9 @@ def test_a_widened_candidate_is_one_that_started_wider():
         information = root @ root.T
         P = np.linalg.inv(information + np.diag([0.0, 0.0, 0.0, *(1.0 / variance)]))
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
-        x, matrices = np.zeros((2, 7)), np.zeros((2, 6, kernels.W))
+        x, matrices = np.zeros((2, 7)), np.zeros((2, 6, sizes.W))
         x[1], matrices[1, :, :6] = [1.0, 0.0, 0.0, 0.0, *bias], P
-        form = SimpleNamespace(x=x, P=matrices.reshape(2, -1), work=np.zeros(kernels.LINES * kernels.LINE))
+        form = SimpleNamespace(x=x, P=matrices.reshape(2, -1), work=np.zeros(sizes.LINES * sizes.LINE))
         memory = np.zeros(gate_rules.MEMORY)
         memory[gate_rules.FIRST_BIAS :] = [*(bias + first), *variance]
         kernels.widen(form, memory)

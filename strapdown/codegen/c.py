@@ -11,6 +11,7 @@ import numpy as np
 from strapdown.codegen.program import MEANINGS, Program, Sensor, place
 from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
+from strapdown.kernels import chains
 
 PUBLIC = ("init", "predict")
 SMALLEST = float(np.finfo(np.float32).tiny)
@@ -82,7 +83,6 @@ def constant_of(sensor: Sensor) -> str:
 
 def members(program: Program) -> list[tuple[str, int, str, str]]:
     """Return name, size (0: a scalar), meaning and type of the numbers of the filter's state."""
-    k = program.kernels
     rows = [
         ("attitude", 4, "q_fb: unit quaternion, scalar first, from body axes to fixed axes"),
         ("bias", 3, "gyro bias, rad/s, body axes"),
@@ -98,7 +98,7 @@ def members(program: Program) -> list[tuple[str, int, str, str]]:
     )
     rows.append(("nis", max(len(program.sensors), 1), "last normalised innovation squared of each sensor"))
     if program.structure.chains:
-        rows.append(("coefficients", k.SET * len(program.model.last), "of the states that decay, for steps of dt"))
+        rows.append(("coefficients", chains.SET * len(program.model.last), "of the states that decay, for steps of dt"))
         rows.append(("step_dt", 0, "s"))
     arrays = () if program.recording is None else program.recording.arrays
     return [(*row, "") for row in rows] + [(a.name, math.prod(a.shape), a.words, a.kind) for a in arrays]

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import live_imu, machine
+from strapdown.kernels import model as model_kernels
+from strapdown.kernels import update as update_kernels
 from strapdown.kernels.algebra import dot, scale, square_root
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
 from strapdown.kernels.rotation import far_turn as far_turn_kernel
@@ -99,8 +100,13 @@ class Program:
 
     @property
     def kernels(self) -> ModuleType:
-        """Kernels of the structure, in the layout in which each element of P is a number."""
-        return machine.instance(filter_kernels, STRUCTURE=self.structure, LANES=2)
+        """Kernels of an update for the structure, in the layout in which each element of P is a number."""
+        return machine.instance(update_kernels, STRUCTURE=self.structure, LANES=2)
+
+    @property
+    def prediction(self) -> ModuleType:
+        """Those of a prediction."""
+        return machine.instance(model_kernels, STRUCTURE=self.structure, LANES=2)
 
     @property
     def n(self) -> int:
@@ -171,12 +177,12 @@ def step(f: Any, delta: Any, dt: Any) -> None:
     if len(f.program.structure.chains) > 0 and f.dt[0] != dt:
         prepare(f, dt)
     comment("attitude, and covariance: Phi P Phi' + Q, exact at constant rate")
-    f.kernels.advance(f.x, f.P, delta, dt, f.program.model, f.coefficients, 0.0)
+    f.prediction.advance(f.x, f.P, delta, dt, f.program.model, f.coefficients, 0.0)
 
 
 def prepare(f: Any, dt: Any) -> None:
     """Coefficients of the states that decay, for steps of dt."""
-    f.kernels.fill_coefficients(f.coefficients, dt, f.program.model)
+    f.prediction.fill_coefficients(f.coefficients, dt, f.program.model)
     f.dt[0] = dt
 
 

@@ -49,6 +49,7 @@ class Target(Function):
         self.state = f = SimpleNamespace(
             program=program,
             kernels=Module(program.kernels, self.kernel.unrolled),
+            prediction=Module(program.prediction, self.kernel.unrolled),
             x=self.array(name_of_state),
             P=Member(self, "f->P", (program.number_of_covariances,)),
             nis=self.array(lambda i: f"f->nis[{i}]"),

@@ -135,9 +135,9 @@ def _propagated(
 ) -> analysis.Outputs:
     """Propagate the covariance of each random source and each deterministic error through the filter's gains."""
     problem, events, kept = path.problem, path.events, len(path.kept)
-    kernels = forward.instance_of(problem.model)
-    n, W, sources = kernels.N, kernels.W, len(random.names)
+    n, sources = problem.model.structure.n, len(random.names)
     body = forward.filter_body(problem, forward.unit_sigmas(problem.record, problem.model, {}))
+    W = body.P.shape[1] // n
     contributions = np.zeros((sources, n, W))
     contributions[:, :6, :6] = random.initial
     # Their arrays must outlive the kernel, which reads them by their addresses.
@@ -149,7 +149,7 @@ def _propagated(
         residual=np.zeros((len(events.time), 3)),
         nis=np.zeros((len(scenario.sensors), 2)),
     )
-    compiled(walk, analysis, kernels)(
+    compiled(walk, forward.instance_of(problem.model, analysis))(
         *problem.gyro,
         _measurements(events),
         1,

@@ -35,8 +35,18 @@ from strapdown.estimation.states import (
     pack,
     restart_bias_variance,
 )
+from strapdown.kernels import (
+    chains,
+    gate,
+    gate_rules,
+    iterated_update,
+    layout,
+    machine,
+    restart_candidate,
+    six_states,
+    structure,
+)
 from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import gate, gate_rules, iterated_update, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -402,7 +412,7 @@ class Judge:
         restart = gate.Restart(
             restart_bias_variance(self.gate, self.problem.initial), start.values, start.covariance, start.start
         )
-        return gate.Body(form=form, options=self.options, restart=restart, counters=self.counters, memory=self.memory)
+        return gate.Body(filter=form, options=self.options, restart=restart, counters=self.counters, memory=self.memory)
 
     def outputs(self, form: structure.Outputs) -> gate.Outputs:
         """Return arrays for the outputs of the gate in addition to the filter's.
@@ -412,7 +422,7 @@ class Judge:
         """
         number = len(self.problem.events.time)
         return gate.Outputs(
-            form=form,
+            filter=form,
             weight=np.empty(number),
             events=np.empty((number + 1 + len(self.problem.events.sensors), 5)),
         )
@@ -504,7 +514,7 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
 
 def aged_states(model: Model, values: Array, covariance: Array, dt: float) -> tuple[Array, Array]:
     """Return values (m,) and covariance (m, m) of error states after dt, s, without measurements: the kernels' function as plain Python."""
-    kernels = instance_of(model)
+    kernels = instance_of(model, restart_candidate)
     x, P = np.append(np.zeros(7), values), np.zeros((kernels.N, kernels.W))
     P[6:, 6 : kernels.N] = covariance
     kernels.age_states(x, P.reshape(-1), np.zeros(kernels.SET * len(model.last)), dt, model)
@@ -514,9 +524,9 @@ def aged_states(model: Model, values: Array, covariance: Array, dt: float) -> tu
 # ------------------------------------------------------------------------------------------------------------- the filter of N error states
 
 
-def instance_of(model: Model) -> ModuleType:
-    """Return the kernels of the filter for the structure of a model."""
-    return machine.instance(filter_kernels, STRUCTURE=model.structure)
+def instance_of(model: Model, template: ModuleType) -> ModuleType:
+    """Return a template of the kernels for the structure of a model."""
+    return machine.instance(template, STRUCTURE=model.structure)
 
 
 def kernel_model(model: Model, variances: tuple[float, float]) -> structure.Model:
@@ -534,26 +544,26 @@ def kernel_model(model: Model, variances: tuple[float, float]) -> structure.Mode
 
 def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     """Return the filter as the kernels' arguments."""
-    model, initial, kernels = problem.model, problem.initial, instance_of(problem.model)
-    x, P = np.zeros((2, kernels.N + 1)), aligned_zeros(2, kernels.N, kernels.W)
+    model, initial, sizes = problem.model, problem.initial, instance_of(problem.model, layout)
+    x, P = np.zeros((2, sizes.N + 1)), aligned_zeros(2, sizes.N, sizes.W)
     if initial.gate is not None and initial.gate.candidate is not None:
         candidate = initial.gate.candidate
         x[1] = np.concatenate([candidate.attitude, candidate.others])
-        P[1, :, : kernels.N] = candidate.covariance
+        P[1, :, : sizes.N] = candidate.covariance
     body = structure.Body(
         model=kernel_model(model, problem.variances),
         x=x,
         P=P.reshape(2, -1),
-        coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
+        coefficients=np.zeros(chains.SET * max(len(model.last), 1)),
         dt=np.zeros(1),
-        work=aligned_zeros(kernels.LINES * kernels.LINE),
+        work=aligned_zeros(sizes.LINES * sizes.LINE),
         shape=model.shape,
         length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
         warming=_warming(problem),
         warming_now=np.zeros(1),
-        root=np.zeros(kernels.N**2),
+        root=np.zeros(sizes.N**2),
     )
     put_state(body, initial)
     return body
@@ -591,7 +601,6 @@ def segment_width(model: Model) -> int:
 def _run(problem: Problem, options: Options) -> Passed:
     """Run the filter of any number of error states, with or without a gate."""
     record, events, model, every = problem.record, problem.events, problem.model, options.every
-    kernels = instance_of(model)
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
     body = filter_body(problem, units)
     out, predictions = _outputs(problem, options)
@@ -605,15 +614,15 @@ def _run(problem: Problem, options: Options) -> Passed:
         form = body._replace(length=body.length[at], turning=body.turning[at], warming=body.warming[intervals])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
-            outputs = judged._replace(form=out_of_part)
-            number, reported = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
+            outputs = judged._replace(filter=out_of_part)
+            number, reported = compiled(walk, instance_of(model, gate))(*arguments, every, judge.body(form), outputs)
             happened += gate_events(judged.events[:reported], events.sensors)
         else:
-            number = compiled(walk, kernels)(*arguments, every, form, out_of_part)
+            number = compiled(walk, instance_of(model, filter_kernels))(*arguments, every, form, out_of_part)
         if number < 0:
             raise TooPreciseError()
     if options.segments:
-        end, n = predictions[number], kernels.N
+        end, n = predictions[number], model.structure.n
         end[:4] = 0.0
         end[4 : 5 + n] = body.x[0]
         end[5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]

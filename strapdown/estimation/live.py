@@ -36,7 +36,7 @@ from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import Judge, Options, gate_events, last_lock_outs
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import Change, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import gate, six_states, structure
+from strapdown.kernels import filter, gate, six_states, structure
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.machine import address_of, compiled, read_only
@@ -144,8 +144,7 @@ class LiveFilter:
 
     def _prepare(self, options: Options) -> None:
         """Make the arrays that the kernels work on, and load the kernels."""
-        judge, model = self._judge, self._problem.model
-        sensors, kernels = len(self._sensors), forward.instance_of(model)
+        judge, model, sensors = self._judge, self._problem.model, len(self._sensors)
         most = max(MAX_MEASUREMENTS, sensors)
         self._whole = not forward.fits_registers(self._problem, options)
         filter_: Any = (
@@ -170,10 +169,10 @@ class LiveFilter:
             self._x, self._body = own[0][:7], filter_._replace(state=own[0])
         body, out = self._body, self._outputs(6 + model.states)
         if options.judged:
-            out = gate.Outputs(form=out, weight=self._weight, events=self._events)
+            out = gate.Outputs(filter=out, weight=self._weight, events=self._events)
             body = judge.body(body)
-        bodies = (gate, kernels) if options.judged else (kernels if self._whole else six_states,)
-        self._arrays = self._live(compiled(walk, *bodies), body, out, length, 2 if options.judged else 1)
+        kernels = forward.instance_of(model, gate if options.judged else filter) if self._whole else six_states
+        self._arrays = self._live(compiled(walk, kernels), body, out, length, 2 if options.judged else 1)
         # Writing to a memory view takes half the time of writing to an array.
         self._call: Any = self._arrays.call.data
         self._report: Any = self._arrays.report.data

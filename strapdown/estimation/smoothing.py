@@ -35,7 +35,7 @@ from strapdown.estimation.states import (
     State,
     covariance_blocks,
 )
-from strapdown.kernels import smoother, smoother_loop, structure
+from strapdown.kernels import chains, smoother, smoother_loop, structure
 from strapdown.kernels.gate_rules import FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude, step_aside
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
@@ -345,9 +345,9 @@ class _ManyStates:
         """
         # The same for all sensors.
         without = self.problem.model.structure._replace(sensors=())
-        kernels = forward.instance_of(replace(self.problem.model, structure=without))
+        kernels = forward.instance_of(replace(self.problem.model, structure=without), smoother)
         model = forward.kernel_model(self.problem.model, self.problem.variances)
-        n = kernels.N
+        n = without.n
         if segments.shape[1] == 32:  # of the filter of six states: the blocks of P, not its triangle by rows
             order = np.argsort(covariance_blocks(_places()))
             segments = np.concatenate([segments[:, :11], segments[:, 11 + order], np.zeros((len(segments), 7))], axis=1)
@@ -360,11 +360,11 @@ class _ManyStates:
             np.ones(len(noisy)),
             forward.aligned_zeros(3 * kernels.W),
             np.zeros(n + kernels.NOISY_WIDTH),
-            np.zeros(kernels.SET * max(len(model.last), 1)),
+            np.zeros(chains.SET * max(len(model.last), 1)),
         )
         space = smoother.Workspace._make((*states, *matrices, *others, noisy))
         models = smoother.Models(model, _with_negative_noise(model))
-        compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
+        compiled(kernels.smooth_back)(segments, starts, first, models, space, smoother.Outputs(*outputs))
 
 
 def _with_negative_noise(model: structure.Model) -> structure.Model:

@@ -18,7 +18,9 @@ from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import kernel_model
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
-from strapdown.kernels import filter, machine
+from strapdown.kernels import machine
+from strapdown.kernels import model as model_kernels
+from strapdown.kernels import rows as row_kernels
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.walk import step_within, turn_squared
@@ -115,7 +117,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, with the kernels' functions."""
-        kernels = machine.instance(filter, STRUCTURE=self._motion.structure)
+        kernels = machine.instance(model_kernels, STRUCTURE=self._motion.structure)
         variances = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
         model = kernel_model(self._motion, variances)
         x, phi, n = np.concatenate([self.attitude, self.bias, self.values]), tuple(part.tolist()), len(self.x)
@@ -177,7 +179,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _measure(self, measurement: SimpleNamespace, sensor: str) -> bool:
         """Update with a measurement."""
         model, x = self._model(sensor, measurement.kind), np.concatenate([self.attitude, self.bias, self.values])
-        kernels = machine.instance(filter, STRUCTURE=model.structure)
+        kernels = machine.instance(row_kernels, STRUCTURE=model.structure)
         rows, residual, axes, _, _ = kernels.rows_and_axes(0, x, measurement, model.numbers, 0.0)
         unit, T = measurement.length, np.array(axes)
         y, H, R = unit * np.array(residual), unit * np.array(rows, np.float64), unit**2 * T @ measurement.noise @ T.T

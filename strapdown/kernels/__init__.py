@@ -7,7 +7,9 @@ one record per lane. A function for lanes has no branches that depend on the dat
 (``sqrt`` is :func:`strapdown.kernels.algebra.square_root`), and creates no arrays; others say that they are for scalars only.
 
 - One loop over a record, with the functions of a *body*: ``walk``.
-- Bodies: ``filter`` (N error states, gated by ``gate``), ``six_states``, ``likelihood``, ``montecarlo_run``
-  (noise too, with the filter of ``montecarlo_six`` or ``montecarlo_filter``).
-- A module whose sizes are known while compiling is a template: :func:`strapdown.kernels.machine.instance` makes a copy with its constants.
+- Bodies: ``filter`` (N error states), ``gate`` (the same, gated), ``six_states``, ``analysis``, ``likelihood`` (also with
+  ``likelihood_outliers``), ``montecarlo_run`` (noise too, with the filter of ``montecarlo_six`` or ``montecarlo_filter``).
+- The filter of N error states: arrays in ``layout``, prediction in ``model``, rows of measurements in ``rows``, updates in ``update``.
+- These and the modules that use them are templates: their sizes are known while compiling, and
+  :func:`strapdown.kernels.machine.instance` makes copies with these constants.
 """

@@ -197,3 +197,11 @@ def divided(X, F):
 def congruent(M, S):
     """Return the symmetric M S Mᵀ."""
     return times_transpose_upper(multiply(M, full(S)), M)
+
+
+def inverse(A):
+    """Return A⁻¹."""
+    a, b, c = A[:3], A[3:6], A[6:]
+    x, y, z = cross(b, c), cross(c, a), cross(a, b)
+    d = 1.0 / dot(a, x)
+    return tuple(d * v[i] for i in range(3) for v in (x, y, z))

@@ -16,22 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import dot, symmetric_times_vector
-from strapdown.kernels.filter import (
-    LINES,
-    PRODUCT,
-    ROWS,
-    advance,
-    apply_transition,
-    clear_step,
-    fill_coefficients,
-    take_row,
-    write,
-    write_transition,
-)
+from strapdown.kernels.chains import fill_coefficients
 from strapdown.kernels.filter_step import transition
+from strapdown.kernels.layout import LINES, PRODUCT, ROWS
 from strapdown.kernels.measurement import HEADING, KIND, Measurements, six_at, vector_at
+from strapdown.kernels.model import advance, apply_transition, write_transition
+from strapdown.kernels.rows import write_rows
 from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.structure import Model
+from strapdown.kernels.update import clear_step, take_row
 from strapdown.kernels.walk import (
     increment_over,  # noqa: F401 - that of the walk, not the filter's
     step_within,
@@ -269,7 +262,7 @@ def propagate_rate(c, body):
 
 def put_rows(shape, filters, measured, e):
     """Write the rows of a measurement to the work space; return their number, and whether it is valid."""
-    rows, _, valid = write(shape, filters.x[0], filters, measured, e, 0.0)
+    rows, _, valid = write_rows(shape, filters.x[0], filters, measured, e, 0.0)
     return rows, valid
 
 

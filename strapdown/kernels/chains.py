@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
+from strapdown.kernels.algebra import congruent, multiply
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, sum_lanes
 
-CALLED = ("chain_step",)
+CALLED = ("chain_step", "fill_coefficients")
 """Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(WIDTH)
@@ -22,6 +23,10 @@ TERMS = 14
 """Number of terms in the series of a chain's transition: accurate to rounding for λ dt ≤ 1/2."""
 NODES = np.concatenate([0.5 * (1.0 + _NODES), 0.5 * _WEIGHTS])
 """Nodes and weights of Gauss's rule with eight nodes on [0, 1], one lane per node."""
+SET = 16
+"""Numbers of a set of coefficients: Φ and Q (6 each, upper triangle by rows) of a chain of up to three states, and ∫ e^{−λs} ds."""
+MEAN = 12
+"""Place of that integral in a set."""
 
 
 def chain_start(chains, k):
@@ -71,3 +76,55 @@ def chain_step(decay, chains, k, first, dt):
         sum_lanes(c * B),
         sum_lanes(c * C),
     )
+
+
+def fill_coefficients(coefficients, dt, model):
+    """Write the sets of coefficients of a step of dt."""
+    decay, chains, last = model.decay, model.chains, model.last
+    for g in range(len(last)):
+        k = last[g]
+        first = chain_start(chains, k)
+        here = SET * g
+        for i in range(SET):
+            coefficients[here + i] = 0.0
+        for j in range(first, k + 1):
+            (a, b, c), Q = chain_step(decay, chains, j, first, dt)
+            row = 2 - (k - j)
+            if row == 2:
+                coefficients[here + 2], coefficients[here + 4], coefficients[here + 5] = a, b, c
+            if row == 1:
+                coefficients[here + 1], coefficients[here + 3] = b, c
+            if row == 0:
+                coefficients[here] = c
+            # Each state of a chain may be driven; its noise reaches the states before it.
+            q = chains[j, 1]
+            if q != 0.0:
+                if row == 2:
+                    coefficients[here + 6] += q * Q[0]
+                    coefficients[here + 7] += q * Q[1]
+                    coefficients[here + 8] += q * Q[2]
+                    coefficients[here + 9] += q * Q[3]
+                    coefficients[here + 10] += q * Q[4]
+                    coefficients[here + 11] += q * Q[5]
+                if row == 1:
+                    coefficients[here + 6] += q * Q[3]
+                    coefficients[here + 7] += q * Q[4]
+                    coefficients[here + 9] += q * Q[5]
+                if row == 0:
+                    coefficients[here + 6] += q * Q[5]
+        rate = decay[k]
+        coefficients[here + MEAN] = -math.expm1(-rate * dt) / rate if rate > 0.0 else dt
+
+
+def double_step(coefficients, here):
+    """Replace Φ and Q of a set of coefficients by those of twice the time."""
+    c = coefficients[here : here + 12]
+    phi = (c[0], c[1], c[2], 0.0, c[3], c[4], 0.0, 0.0, c[5])
+    Q = (c[6], c[7], c[8], c[9], c[10], c[11])
+    R = congruent(phi, Q)
+    phi = multiply(phi, phi)
+    for i, value in enumerate((phi[0], phi[1], phi[2], phi[4], phi[5], phi[8])):
+        c[i] = value
+    for i in range(3):
+        c[6 + i] = Q[i] + R[i]
+        c[9 + i] = Q[3 + i] + R[3 + i]

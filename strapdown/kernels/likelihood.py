@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import combine, dot
-from strapdown.kernels.filter import SET, advance, fill_coefficients, take
+from strapdown.kernels.chains import SET, fill_coefficients
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, select, store, sum_lanes
 from strapdown.kernels.measurement import HEADING, KIND, degrees_of_freedom, vector_at
+from strapdown.kernels.model import advance
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 from strapdown.kernels.state import load_triple
 from strapdown.kernels.structure import Body as Filter
+from strapdown.kernels.update import take
 from strapdown.kernels.walk import MAX_TURN
 
 REPLACEABLE = ("counted",)
@@ -34,7 +36,7 @@ ROOM = 15 * WIDTH
 
 
 class Chains(NamedTuple):
-    """Error states that decay or are driven, of one lane, as :func:`strapdown.kernels.filter.fill_coefficients` takes them."""
+    """Error states that decay or are driven, of one lane, as :func:`strapdown.kernels.chains.fill_coefficients` takes them."""
 
     decay: np.ndarray
     chains: np.ndarray

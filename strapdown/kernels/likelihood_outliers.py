@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.filter import LINES, PRIOR, ROWS, STEP, apply_step, clear_step, take_row, write
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
+from strapdown.kernels.layout import LINES, PRIOR, ROWS, STEP
 from strapdown.kernels.likelihood import WIDE, WORK, deviance_of
+from strapdown.kernels.rows import write_rows
+from strapdown.kernels.update import apply_step, clear_step, take_row
 
 
 def mixed(share, nis, product, wide, wide_product):
@@ -31,7 +33,7 @@ def counted(e, span, measured, body, out):
     f, room, like = body.filters, body.room, broadcast(0.0)
     x, P, Q, work = f.x[0], f.P[0], f.P[1], f.work
     line = len(work) // LINES
-    rows, _, _ = write(f.shape[measured.sensor[e]], x, f, measured, e, like)
+    rows, _, _ = write_rows(f.shape[measured.sensor[e]], x, f, measured, e, like)
     for i in range(0, len(P), WIDTH):
         store(Q, i, load(P, i))
     size = len(x) - WIDTH

@@ -5,12 +5,12 @@ compiled copies ("twins") together, so the source needs no decorator and remains
 
 A kernel may leave functions open: their names are in ``OPEN`` of its module, which has only their signatures. :func:`compiled` is given the
 modules that define them; in this way :func:`strapdown.kernels.walk.walk` is the loop of every filter. A name in ``REPLACEABLE`` has a
-default, which is used if no module defines it. If one of these modules is an :func:`instance`, it also defines what kernels import from the
-module of which it is a copy.
+default, which is used if no module defines it.
 """
 
 from __future__ import annotations
 
+import builtins
 import functools
 import hashlib
 import platform
@@ -18,6 +18,7 @@ import re
 import sys
 from collections.abc import Callable, Hashable
 from importlib import import_module
+from importlib.abc import InspectLoader
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, cast
@@ -31,6 +32,8 @@ INTRINSIC = {f"{PACKAGE}.lane_values": f"{PACKAGE}.lanes", f"{PACKAGE}.argument_
 
 _SOURCES = {path.stem: path.read_bytes() for path in Path(__file__).parent.glob("*.py")}
 """Read on import: if a source is edited later, the code of this process is not stored as that of the edited one."""
+TEMPLATE = "layout"
+"""The module that reads constants which :func:`instance` gives."""
 _COMPILER = ("machine", "cache", "compiler", "tracing", "lanes", "addresses")
 """Modules on which the code of every kernel depends."""
 _IMPORTED = re.compile(rb"^ *from strapdown\.kernels(?:\.(\w+) import| import (.+))", re.MULTILINE)
@@ -72,17 +75,11 @@ def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
 
 
-def _instance_of(function: FunctionType, parts: tuple[ModuleType, ...]) -> ModuleType | None:
-    """Return the instance of a function's module among ``parts``."""
-    return next((module for module in parts if vars(module).get("TEMPLATE") == function.__module__), None)
-
-
 @functools.cache
 def _depends_on_parts(function: FunctionType, parts: tuple[ModuleType, ...]) -> bool:
     """Return whether a function refers, directly or indirectly, to one that ``parts`` define."""
     return any(
-        name in _open(function) or _instance_of(value, parts) or _depends_on_parts(value, parts)
-        for name, value in _kernels_named(function).items()
+        name in _open(function) or _depends_on_parts(value, parts) for name, value in _kernels_named(function).items()
     )
 
 
@@ -95,8 +92,7 @@ def _open(scope: FunctionType | ModuleType) -> tuple[str, ...]:
 def _defined(name: str, value: FunctionType, function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return the value of a name in a function: if the name is open, its definition in the first of ``parts`` that has one."""
     if name not in _open(function):
-        of_instance = _instance_of(value, parts)
-        return cast(FunctionType, getattr(of_instance, value.__name__)) if of_instance else value
+        return value
     for module in parts:
         definition = getattr(module, name, None)
         if isinstance(definition, FunctionType) and name not in _open(module):
@@ -229,16 +225,25 @@ def address_of(dispatcher: Any, arguments: tuple[Any, ...]) -> int:
 
 @functools.cache
 def instance(module: ModuleType, **constants: Hashable) -> ModuleType:
-    """Return a copy of a kernel module with other values of constants that it reads from its globals while it is imported.
+    """Return a copy of a kernel module with other values of constants, and with copies of the modules that it imports if these use them.
 
-    These constants are known while its functions are compiled, like the parameters of a template. Equal constants give the same copy.
+    A template reads the constants from its globals while it is imported (:data:`TEMPLATE`), or imports one that does. They are known while
+    its functions are compiled, like the parameters of a template in C++. Equal constants give the same copy.
     """
     digest = hashlib.sha256(repr(sorted(constants.items())).encode()).hexdigest()[:16]
     copy = ModuleType(f"{module.__name__}_{digest}", module.__doc__)
+
+    def import_copy(name: str, *arguments: Any) -> ModuleType:
+        imported = __import__(name, *arguments)
+        package, _, stem = name.rpartition(".")
+        return instance(imported, **constants) if package == PACKAGE and TEMPLATE in _used(stem) else imported
+
     copy.__file__ = module.__file__
-    copy.__dict__.update(constants, TEMPLATE=module.__name__)
+    copy.__dict__.update(constants, __builtins__={**vars(builtins), "__import__": import_copy})
     sys.modules[copy.__name__] = copy  # numba looks there for the module of a function that it reads from its cache
-    exec(compile(Path(str(module.__file__)).read_text(), str(module.__file__), "exec"), copy.__dict__)
+    # Python's byte code, from its cache: to compile the source would take most of the time.
+    code = cast(InspectLoader, module.__loader__).get_code(module.__name__)
+    exec(cast(CodeType, code), copy.__dict__)
     return copy
 
 

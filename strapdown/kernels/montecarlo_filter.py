@@ -1,13 +1,16 @@
-"""The filter of N error states in a Monte Carlo: an instance of :mod:`strapdown.kernels.filter` for eight runs."""
+"""The filter of N error states in a Monte Carlo: that of :mod:`strapdown.kernels.filter` for eight runs."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from strapdown.kernels.filter import element_at, propagate_row, put_element, take, whole_element
+from strapdown.kernels.filter import whole_element
 from strapdown.kernels.lane_values import WIDTH, load_like, store
+from strapdown.kernels.layout import element_at, put_element
+from strapdown.kernels.model import propagate
 from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.state import store_several
+from strapdown.kernels.update import take
 
 
 class Progress(NamedTuple):
@@ -31,7 +34,7 @@ def start_filters(q, b, body, like):
 
 def propagated(state, part, dt, body, like):
     """Propagate all runs."""
-    propagate_row(body.filters, 0, part, dt, like)
+    propagate(body.filters, 0, part, dt, like)
     return state
 
 

@@ -6,8 +6,7 @@ nothing of the size of P is subtracted. A row of N is by the first form, or by t
 of the noise. The later covariance is transformed to the tangent space at the predicted attitude before the step, and the result to that at
 the smoothed attitude after it; so are states that rotate with the attitude.
 
-The functions of :mod:`strapdown.kernels.filter` are those of an instance. Matrices are stored by rows, padded to a multiple of
-eight columns.
+Matrices are stored by rows, padded to a multiple of eight columns.
 """
 
 from __future__ import annotations
@@ -16,32 +15,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.filter import (
+from strapdown.kernels.chains import fill_coefficients
+from strapdown.kernels.lane_values import WIDTH, broadcast, lanes_of, load, load_like, store
+from strapdown.kernels.layout import CHUNKS, EIGHT, STATES, N, W, chunk_at, copy_values, put_chunk
+from strapdown.kernels.model import (
+    CHAINED,
+    advance_state,
+    advance_without_noise,
     apply_transition,
-    fill_coefficients,
-    gather_noisy_columns,
-    minus_row,
-    noisy_row_at,
-    predict_state,
-    put_attitude,
-    put_noisy_row,
-    put_row,
-    row_at,
-    scatter_noisy_columns,
-    transform,
-    turn_attitude,
-    turn_carried,
     write_noise,
     write_transition,
 )
-from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
+from strapdown.kernels.tangent_space import put_attitude, turn_attitude, turn_carried
 
 CALLED = ("factorise", "solve", "add_product", "load_segment", "write_small_columns")
 
 ROWS = 6
 """Rows that :func:`add_product` computes together."""
+NOISY = tuple(sorted({*range(6), *CHAINED}))
+"""States with process noise."""
+NOISY_WIDTH = len(NOISY) + 7 - (len(NOISY) + 7) % 8
+NOISY_CHUNKS = tuple(range(0, NOISY_WIDTH, 8))
 
 
 class Models(NamedTuple):
@@ -194,16 +190,16 @@ def step_back(segments, k, models, space):
     load_segment(segments, k, x, P, width)
     dt = segments[k, 0]
     part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
-    copy_state(x, predicted)
+    copy_values(x, predicted, N + 1, 0.0)
     fill_coefficients(coefficients, dt, models.forward)
-    predict_state(predicted, part, dt, models.forward, coefficients, 0.0)
+    advance_state(predicted, part, dt, models.forward, coefficients, 0.0)
     relative_error(predicted, later_x, later_P, error)
     fill_coefficients(coefficients, -dt, models.backward)
     write_transition(predicted, back, -dt, models.backward, coefficients, space.top, 0.0)
     apply_transition(error, space.top, coefficients, 0.0)
     write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
-    copy_state(predicted, after)
-    transform(after, later_P, back, -dt, models.backward, coefficients, 0.0)
+    copy_values(predicted, after, N + 1, 0.0)
+    advance_without_noise(after, later_P, back, -dt, models.backward, coefficients, 0.0)
     clear(columns, n * noisy_width)
     gather_noisy_columns(Q, columns)
     for i in range(0, n * noisy_width, WIDTH):
@@ -227,12 +223,6 @@ def clear(A, start):
     """Set A to zero from ``start`` on."""
     for i in range(start, len(A), WIDTH):
         store(A, i, broadcast(0.0))
-
-
-def copy_state(x, y):
-    """Copy a state to y."""
-    for i in range(len(x)):
-        y[i] = x[i]
 
 
 def write_small_columns(P, Q, gain, kept, states, n, width):
@@ -334,3 +324,54 @@ def write_smoothed(out, edge, x, P, n, width):
                 value = 0.5 * (P[width * i + j] + P[width * j + i])
                 out.covariance[edge, i, j] = value
                 out.covariance[edge, j, i] = value
+
+
+# ------------------------------------------------------------- matrices with a column for each state, and for the states with process noise
+
+
+def row_at(A, i):
+    """Return row i of a matrix (rows of W)(chunks)."""
+    return tuple(chunk_at(A, i, c, 0.0) for c in CHUNKS)
+
+
+def minus_row(row, factor, other):
+    """Return a row less a factor times another."""
+    return tuple(t - factor * u for t, u in zip(row, other, strict=True))
+
+
+def put_row(A, i, factor, row):
+    """Write a factor times a row to row i of a matrix."""
+    for c, t in zip(CHUNKS, row, strict=True):
+        put_chunk(A, i, c, factor * t)
+
+
+def noisy_row_at(A, i):
+    """Return row i of a matrix with columns for the states with process noise(chunks)."""
+    return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_CHUNKS)
+
+
+def put_noisy_row(A, i, factor, row):
+    """Write a factor times a row to row i of such a matrix."""
+    for c, t in zip(NOISY_CHUNKS, row, strict=True):
+        store(A, NOISY_WIDTH * i + c, factor * t)
+
+
+def gather_noisy_columns(A, B):
+    """Write the columns of a matrix (rows of W), of which only rows of states with process noise are not zero, for these states to B."""
+    for i in STATES:
+        if i in NOISY:
+            for c, k in enumerate(NOISY):
+                B[NOISY_WIDTH * i + c] = A[W * i + k]
+        else:
+            for c in NOISY_CHUNKS:
+                store(B, NOISY_WIDTH * i + c, lanes_of(EIGHT))
+
+
+def scatter_noisy_columns(columns, block, P):
+    """Write such columns to P on both sides of the diagonal; ``block`` has the rows of the states with process noise."""
+    for c, k in enumerate(NOISY):
+        for i in STATES:
+            if i not in NOISY:
+                P[W * i + k] = P[W * k + i] = columns[NOISY_WIDTH * i + c]
+        for d, j in enumerate(NOISY):
+            P[W * k + j] = block[NOISY_WIDTH * c + d]

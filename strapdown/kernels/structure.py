@@ -193,7 +193,7 @@ class Gains(NamedTuple):
     gain: tuple[Any, ...]
     """g of each row: P h, given the rows before it, over the root of its innovation's variance."""
     step: tuple[Any, ...]
-    """Correction of the state, by parts."""
+    """Correction of the state, in chunks (:mod:`strapdown.kernels.layout`)."""
     errors: tuple[Any, ...]
     """Innovations, and their variances."""
     variances: tuple[Any, ...]

@@ -30,8 +30,8 @@ from strapdown.estimation.schedule import innovations_by_sensor, skipped_too
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import (
-    filter,
     gyro_errors,
+    layout,
     machine,
     montecarlo_filter,
     montecarlo_run,
@@ -129,10 +129,10 @@ class _Prepared:
     """Record of the filter's steps without noise, with the filter's σ, and the filter."""
     record: ImuRecord
     """The same record with nominal σ."""
-    kernels: ModuleType
-    """Filter for several runs, for the structure of the model."""
-    parts: tuple[ModuleType, ...]
-    """Modules that define the filter for the kernel of the runs."""
+    layout: ModuleType
+    """Layout of the arrays of several runs, for the structure of the model."""
+    filter: ModuleType
+    """Module that defines the filter for the kernel of the runs."""
     gyro: montecarlo_run.Gyro
     start: montecarlo_run.Start
     events: montecarlo_run.Events
@@ -180,7 +180,7 @@ def _prepare(plan: Plan) -> _Prepared:
     initial = setup.initial_state(plan.setup, record.truth.attitude[0], record.truth.bias[0])
     problem = setup.prepared(setup.modelled_record(quiet, plan.setup), plan.setup, initial)
     events, model = problem.events, problem.model
-    kernels = machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH)
+    lanes: dict[str, Any] = {"STRUCTURE": model.structure, "LANES": WIDTH}
     plain = not model.states and events.noise_by_axis is None
     noise = np.empty((len(events.time), 6))
     noise[events.row] = events.body_noise
@@ -192,8 +192,8 @@ def _prepare(plan: Plan) -> _Prepared:
     return _Prepared(
         problem=problem,
         record=record,
-        kernels=kernels,
-        parts=(montecarlo_six,) if plain else (montecarlo_filter, kernels),
+        layout=machine.instance(layout, **lanes),
+        filter=montecarlo_six if plain else machine.instance(montecarlo_filter, **lanes),
         gyro=_gyro_terms(plan, record, model.limit, turns),
         start=montecarlo_run.Start(
             attitude=np.ascontiguousarray(record.truth.attitude[0]),
@@ -362,8 +362,8 @@ class _Group:
     def __init__(self, plan: Plan, *, every: int | None = None, detail: bool = False) -> None:
         self.plan, self.prepared = plan, _prepared(plan)
         self.every = plan.every if every is None else every
-        prepared, kernels, sensors = self.prepared, self.prepared.kernels, len(plan.sensors)
-        steps, events, n = len(prepared.record.increments), len(prepared.problem.events.time), kernels.N
+        prepared, arrays, sensors = self.prepared, self.prepared.layout, len(plan.sensors)
+        steps, events, n = len(prepared.record.increments), len(prepared.problem.events.time), arrays.N
         self.epochs = steps // self.every + 1
         self.truth = np.ascontiguousarray(prepared.truth[:: self.every])
         self.gyro = prepared.gyro._replace(true_bias=np.ascontiguousarray(prepared.gyro.true_bias[:: self.every]))
@@ -385,11 +385,11 @@ class _Group:
         )
         self.filters = prepared.filters._replace(
             x=np.zeros((2, (n + 1) * WIDTH)),
-            P=np.zeros((2, kernels.SIZE_OF_P)),
+            P=np.zeros((2, arrays.SIZE_OF_P)),
             coefficients=np.zeros_like(prepared.filters.coefficients),
             dt=np.zeros(1),
             turning=np.zeros(prepared.filters.turning.size * WIDTH),
-            work=np.zeros(kernels.LINES * kernels.LINE * WIDTH),
+            work=np.zeros(arrays.LINES * arrays.LINE * WIDTH),
         )
         self.measured = prepared.problem.events.measurements._replace(value=np.zeros(4 * WIDTH), noise=prepared.noise)
 
@@ -421,7 +421,7 @@ class _Group:
     def _run(self) -> bool:
         prepared = self.prepared
         return bool(
-            compiled(walk, montecarlo_run, *prepared.parts)(
+            compiled(walk, montecarlo_run, prepared.filter)(
                 prepared.gyro.edges,
                 read_only(prepared.record.increments),
                 self.measured,
@@ -514,7 +514,7 @@ def replay(plan: Plan, run: int) -> Replay:
     group = _Group(plan, every=1, detail=True)
     group.advance(run)
     problem, record = group.prepared.problem, group.prepared.record
-    events, n = problem.events, group.prepared.kernels.N
+    events, n = problem.events, group.prepared.layout.N
     assert record.truth is not None
     lengths = (KEPT, 3, 10, 2 * (n - 6))
     flat = zip((group.kept, group.draws.increments, *group.detail), lengths, strict=True)

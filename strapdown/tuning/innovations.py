@@ -28,8 +28,9 @@ from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import state_of_whole_bias
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
-from strapdown.kernels import filter, likelihood_outliers, machine, structure
+from strapdown.kernels import layout, likelihood_outliers, machine, structure
 from strapdown.kernels import likelihood as kernel
+from strapdown.kernels.chains import SET
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
@@ -76,10 +77,9 @@ class Prepared:
     driven: np.ndarray
     """Places in the model's numbers of that change."""
 
-    @property
-    def kernels(self) -> ModuleType:
-        """Kernels of the filter; no field, because a module cannot be pickled."""
-        return machine.instance(filter, STRUCTURE=self.filter[0].structure, LANES=WIDTH, PARAMETERS=True)
+    def instance_of(self, template: ModuleType) -> ModuleType:
+        """Return a template of the kernels for the filter; no field, because a module cannot be pickled."""
+        return machine.instance(template, STRUCTURE=self.filter[0].structure, LANES=WIDTH, PARAMETERS=True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -216,12 +216,12 @@ class Likelihood(Objective):
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
         noise, ones = self.filter_setup.process_noise, lane.get(SCALE, np.ones(WIDTH))
         models, states = zip(*self._filters(case, rows), strict=True)
-        model, kernels, upper = models[0], case.kernels, np.triu_indices(case.kernels.N)
+        model, sizes = models[0], case.instance_of(layout)
         decay, chains = np.stack([model.decay for model in models]), np.stack([model.chains for model in models])
         rates = [(a.tobytes(), b.tobytes()) for a, b in zip(decay, chains, strict=True)]
-        x, P = np.zeros((2, (kernels.N + 1) * WIDTH)), np.zeros((2, kernels.SIZE_OF_P))
+        x, P = np.zeros((2, (sizes.N + 1) * WIDTH)), np.zeros((2, sizes.SIZE_OF_P))
         x[0] = _in_lanes([np.concatenate([state.attitude, state.bias, state.values]) for state in states])
-        P[0] = _in_lanes([state.covariance[upper] for state in states])
+        P[0] = _in_lanes([state.covariance[np.triu_indices(sizes.N)] for state in states])
         return kernel.Body(
             filters=structure.Body(
                 model=structure.Model(
@@ -236,9 +236,9 @@ class Likelihood(Objective):
                 ),
                 x=x,
                 P=P,
-                coefficients=np.zeros(kernels.SET * max(len(model.last), 1) * WIDTH),
+                coefficients=np.zeros(SET * max(len(model.last), 1) * WIDTH),
                 dt=np.zeros(1),
-                work=np.zeros(kernels.LINES * kernels.LINE * WIDTH),
+                work=np.zeros(sizes.LINES * sizes.LINE * WIDTH),
                 shape=model.shape,
                 length=case.lengths,
                 turning=case.turning,
@@ -248,7 +248,7 @@ class Likelihood(Objective):
             decay=decay,
             chains=chains,
             same=np.array([rates.index(rate) for rate in rates]),
-            coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
+            coefficients=np.zeros(SET * max(len(model.last), 1)),
             driven=case.driven,
             temperature=0.5 * (case.warming[1:] + case.warming[:-1]),
             outliers=np.concatenate(outliers_at(rows)) if self.mixed else np.empty(0),
@@ -281,7 +281,7 @@ class Likelihood(Objective):
             "probability": np.empty((len(events.time) if outliers else 0, 2)),
         }
         out = kernel.Outputs(**room | {"minus_log": room["minus_log"].reshape(-1)})
-        bodies = (likelihood_outliers, kernel, case.kernels) if self.mixed else (kernel, case.kernels)
+        bodies = map(case.instance_of, (likelihood_outliers, kernel) if self.mixed else (kernel,))
         compiled(walk, *bodies)(*case.problem.gyro, events.measurements, 1, body._replace(free=free, epochs=kept), out)
         return room
 
