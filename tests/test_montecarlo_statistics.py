@@ -19,7 +19,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.montecarlo import engine, plan, scalar, statistics
 from strapdown.montecarlo.coning_study import FilterOutcome
-from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
+from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, bin_edges, bin_of
 
 planned = functools.partial(replace, PLAN)
 
@@ -27,31 +27,26 @@ planned = functools.partial(replace, PLAN)
 # ------------------------------------------------------------------------------------------------------------ histogram
 
 
-@pytest.mark.parametrize("exponent", [ERROR_EXPONENT, NEES_EXPONENT])
-def test_bins_are_those_of_their_edges(exponent):
-    edges = bin_edges(exponent)
+def test_bins_are_those_of_their_edges():
+    edges = bin_edges()
     assert len(edges) == BINS + 1
-    assert edges[0] == 2.0**exponent
+    assert edges[0] == 2.0**ERROR_EXPONENT
     assert np.all(np.diff(edges) > 0.0)
     assert np.diff(edges).max() / edges[np.argmax(np.diff(edges))] <= 0.125
     random = np.random.default_rng(1)
     values = np.exp(random.uniform(np.log(edges[0]), np.log(edges[-1]), 5000))
-    assert np.array_equal(bin_of(values, exponent), np.searchsorted(edges, values, side="right") - 1)
-    assert np.array_equal(bin_of(edges[:-1], exponent), np.arange(BINS))
-    assert np.array_equal(bin_of(np.nextafter(edges[1:], 0.0), exponent), np.arange(BINS))
-    assert bin_of(1.0, exponent) == -8 * exponent
-    assert bin_of(np.array([0.0, 5e-324, edges[-1], 1e300]), exponent).tolist() == [0, 0, BINS - 1, BINS - 1]
+    assert np.array_equal(bin_of(values), np.searchsorted(edges, values, side="right") - 1)
+    assert np.array_equal(bin_of(edges[:-1]), np.arange(BINS))
+    assert np.array_equal(bin_of(np.nextafter(edges[1:], 0.0)), np.arange(BINS))
+    assert bin_of(1.0) == -8 * ERROR_EXPONENT
+    assert bin_of(np.array([0.0, 5e-324, edges[-1], 1e300])).tolist() == [0, 0, BINS - 1, BINS - 1]
 
 
 @pytest.mark.parametrize("probability", [0.01, 0.1, 0.5, 0.9, 0.99, 0.999])
 def test_quantiles_are_those_of_the_sample(probability):
     random = np.random.default_rng(2)
     error = 1e-4 * np.abs(random.standard_normal(20000))
-    nees = random.chisquare(6.0, 20000)
-    histogram = np.zeros((1, 9, BINS), np.int64)
-    for column in range(9):
-        exponent = ERROR_EXPONENT if column < 6 else NEES_EXPONENT
-        histogram[0, column] = np.bincount(bin_of(error if column < 6 else nees, exponent), minlength=BINS)
+    histogram = np.tile(np.bincount(bin_of(error), minlength=BINS), (1, 6, 1))
     total = replace(scalar.run_chunk(PLAN, 0, 1), histogram=histogram)
     # Between the edges of the bin that holds it, and in the midst of the sample far closer.
     ratio = total.error_quantile(probability) / np.quantile(error, probability)
@@ -79,7 +74,7 @@ def test_every_sum_is_what_its_definition_says():
     m = PLAN.epochs + 1
     error, product, covariance = np.zeros((m, 6)), np.zeros((m, 6, 6)), np.zeros((m, 6, 6))
     nees, logs = np.zeros((m, 3)), np.zeros((m, 3))
-    coverage, histogram = np.zeros((m, 6, 3), int), np.zeros((m, 9, BINS), int)
+    coverage, histogram = np.zeros((m, 6, 3), int), np.zeros((m, 6, BINS), int)
     nis, degrees = np.zeros((2, PLAN.nis_bins)), np.zeros((2, PLAN.nis_bins), int)
     score, kept = {}, {}
     for run in range(first, first + runs):
@@ -100,10 +95,9 @@ def test_every_sum_is_what_its_definition_says():
                 value = e[a:z] @ np.linalg.inv(P[a:z, a:z]) @ e[a:z]
                 nees[k, c] += value
                 logs[k, c] += math.log(value)
-                histogram[k, 6 + c, np.searchsorted(bin_edges(NEES_EXPONENT), value, side="right") - 1] += 1
                 peak = max(peak, value) if c == 0 else peak
             for i in range(6):
-                histogram[k, i, np.searchsorted(bin_edges(ERROR_EXPONENT), abs(e[i]), side="right") - 1] += 1
+                histogram[k, i, np.searchsorted(bin_edges(), abs(e[i]), side="right") - 1] += 1
                 for j in range(3):
                     coverage[k, i, j] += abs(e[i]) <= (j + 1) * math.sqrt(P[i, i])
             kept[run, k] = e, np.sqrt(np.diag(P))

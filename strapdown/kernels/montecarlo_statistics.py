@@ -88,12 +88,12 @@ class Sums(NamedTuple):
     coverage: np.ndarray
     """(m, 6, 3)"""
     histogram: np.ndarray
-    """(m, 9, bins)"""
+    """(m, 6, bins)"""
     scratch: np.ndarray
-    """Words (9 · 8,)."""
+    """Words (6 · 8,)."""
 
 
-def accumulate(kept, valid, truth, error_bins, nees_bins, out, score):
+def accumulate(kept, valid, truth, bins, out, score):
     """Add eight runs to the sums.
 
     Parameters
@@ -104,7 +104,7 @@ def accumulate(kept, valid, truth, error_bins, nees_bins, out, score):
         1 for each run that counts, 0 for the others.
     truth : array (m, 4)
         True attitudes.
-    error_bins, nees_bins : array of words (2,)
+    bins : array of words (2,)
         First and last of the shifted bits.
     out : Sums
     score : array (8,)
@@ -135,12 +135,11 @@ def accumulate(kept, valid, truth, error_bins, nees_bins, out, score):
         add_up(out.sums, row, 0, good, (*e, *products(e_theta, e_bias), *P, *nees))
         multiply_nees(out.sums, row, good, nees)
         add_coverage(out.coverage, row, good, e, (P[0], P[3], P[5], C[0], C[3], C[5]))
-        store_bins(out.scratch, error_bins, e, 0)
-        store_bins(out.scratch, nees_bins, nees, 6)
+        store_bins(out.scratch, bins, e)
         store(score, 0, select(good, 1.0, like))
         for lane in range(n):
             if score[lane] > 0.0:
-                for c in range(9):
+                for c in range(6):
                     out.histogram[row, c, out.scratch[c * n + lane]] += 1
     store(score, 0, worst)
 
@@ -178,7 +177,7 @@ def add_coverage(coverage, row, good, e, variances):
         coverage[row, i, 2] += number_where(good & (squared <= 9.0 * variance))
 
 
-def store_bins(scratch, bounds, values, first):
-    """Write the bins of |x| of each value, from place ``first`` on."""
+def store_bins(scratch, bounds, values):
+    """Write the bins of |x| of each value."""
     for i, x in enumerate(values):
-        store(scratch, (first + i) * len(x), bin_numbers(select(x < 0.0, -x, x), bounds[0], bounds[1]))
+        store(scratch, i * len(x), bin_numbers(select(x < 0.0, -x, x), bounds[0], bounds[1]))

@@ -354,14 +354,13 @@ def _write(path: Path, campaign: Campaign) -> None:
 
 
 def _put_statistics(group: Any, statistics: Statistics) -> None:
-    from strapdown.montecarlo.statistics import BINS_PER_OCTAVE, ERROR_EXPONENT, NEES_EXPONENT
+    from strapdown.montecarlo.statistics import BINS_PER_OCTAVE, ERROR_EXPONENT
 
     attributes = {
         "runs": statistics.runs,
         "sensors": json.dumps(statistics.sensors),
         "bins_per_octave": BINS_PER_OCTAVE,
         "first_error_exponent": ERROR_EXPONENT,
-        "first_nees_exponent": NEES_EXPONENT,
     }
     set_attributes(group, attributes)
     for name, layout in ARRAYS.items():

@@ -47,13 +47,11 @@ from strapdown.kernels.walk import walk
 from strapdown.montecarlo.plan import Plan, initial_sigmas, unit
 from strapdown.montecarlo.statistics import (
     BINS,
-    ERROR_EXPONENT,
     EXAMPLES,
-    NEES_EXPONENT,
+    FIRST_BIN,
     Counts,
     Replay,
     Statistics,
-    first_bin,
     worst,
 )
 from strapdown.randomness import generator
@@ -450,17 +448,17 @@ def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
     sums = np.zeros((m, montecarlo_statistics.SUMS, WIDTH))
     sums[:, montecarlo_statistics.NEES_PRODUCT :: 2] = 1.0
     finite = np.zeros(m, np.int64)
-    coverage, histogram = np.zeros((m, 6, 3), np.int64), np.zeros((m, 9, BINS), np.int64)
+    coverage, histogram = np.zeros((m, 6, 3), np.int64), np.zeros((m, 6, BINS), np.int64)
     nis = np.zeros_like(group.nis)
-    scratch, score = np.zeros(9 * WIDTH, np.uint64), np.zeros(WIDTH)
-    bins = [np.array([0, BINS - 1], np.uint64) + np.uint64(first_bin(e)) for e in (ERROR_EXPONENT, NEES_EXPONENT)]
+    scratch, score = np.zeros(6 * WIDTH, np.uint64), np.zeros(WIDTH)
+    bins = np.array([0, BINS - 1], np.uint64) + np.uint64(FIRST_BIN)
     out = montecarlo_statistics.Sums(finite, sums.reshape(-1), coverage, histogram, scratch)
     scores, examples = np.empty(-(-runs // WIDTH) * WIDTH), []
     for start in range(0, runs, WIDTH):
         group.advance(first_run + start)
         counted = min(WIDTH, runs - start)
         valid = (np.arange(WIDTH) < counted).astype(np.float64)
-        compiled(montecarlo_statistics.accumulate)(group.kept, valid, group.truth, *bins, out, score)
+        compiled(montecarlo_statistics.accumulate)(group.kept, valid, group.truth, bins, out, score)
         scores[start : start + WIDTH] = score
         nis[:, :counted] += group.nis[:, :counted]
         for k in range(min(EXAMPLES - first_run - start, counted)):

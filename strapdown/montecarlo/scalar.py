@@ -19,9 +19,7 @@ from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo.plan import Dispersions, Plan, initial_sigmas, unit
 from strapdown.montecarlo.statistics import (
-    ERROR_EXPONENT,
     EXAMPLES,
-    NEES_EXPONENT,
     Replay,
     Statistics,
     bin_of,
@@ -160,8 +158,7 @@ class Sums:
         sums.nees_sum[m] += squares
         sums.log_nees_sum[m] += np.log(np.maximum(squares, _TINY))
         sums.coverage[m] += np.abs(e)[:, :, None] <= sigma[m][:, :, None] * np.array([1.0, 2.0, 3.0])
-        bins = np.concatenate([bin_of(np.abs(e), ERROR_EXPONENT), bin_of(squares, NEES_EXPONENT)], axis=1)
-        sums.histogram[m[:, None], np.arange(9), bins] += 1
+        sums.histogram[m[:, None], np.arange(6), bin_of(np.abs(e))] += 1
         self.scores.append((run, float(nees[:, 0].max()) if good.all() else np.inf))
         if run < EXAMPLES:
             self.examples.append((run, error, sigma))

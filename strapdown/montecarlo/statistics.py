@@ -44,30 +44,25 @@ OCTAVES = 43
 BINS = BINS_PER_OCTAVE * OCTAVES
 ERROR_EXPONENT = -40
 """Bins of errors range from 2⁻⁴⁰ (9.1e-13 rad or rad/s) to 8; values outside are counted in the first and last."""
-NEES_EXPONENT = -16
-"""Bins of the NEES range from 2⁻¹⁶ to 2²⁷."""
 SHIFT = 49
 """Right shift of a double's bits that leaves the exponent and three bits of the mantissa: the bin, up to a constant."""
+FIRST_BIN = (1023 + ERROR_EXPONENT) * BINS_PER_OCTAVE
+"""That constant: bin 0 begins at 2 to ``ERROR_EXPONENT``."""
 
 SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
 """Column of the NEES and degrees of freedom of each subset of the states."""
 
 
-def first_bin(exponent: int) -> int:
-    """Return the offset subtracted from the shifted bits of a double, so that bin 0 begins at 2 to ``exponent``."""
-    return (1023 + exponent) * BINS_PER_OCTAVE
-
-
-def bin_of(value: ArrayLike, exponent: int) -> Counts:
-    """Return the bins of non-negative numbers: ``(bits >> SHIFT) − first_bin(exponent)``, clipped to 0 … BINS − 1."""
+def bin_of(value: ArrayLike) -> Counts:
+    """Return the bins of non-negative numbers: ``(bits >> SHIFT) − FIRST_BIN``, clipped to 0 … BINS − 1."""
     bits = np.array(value, dtype=np.float64, order="C").view(np.int64)
-    return np.asarray(np.clip((bits >> SHIFT) - first_bin(exponent), 0, BINS - 1))
+    return np.asarray(np.clip((bits >> SHIFT) - FIRST_BIN, 0, BINS - 1))
 
 
-def bin_edges(exponent: int) -> Array:
+def bin_edges() -> Array:
     """Return the edges of the bins (BINS + 1,)."""
     octave, part = np.divmod(np.arange(BINS + 1), BINS_PER_OCTAVE)
-    return np.asarray(np.ldexp(1.0 + part / BINS_PER_OCTAVE, exponent + octave))
+    return np.asarray(np.ldexp(1.0 + part / BINS_PER_OCTAVE, ERROR_EXPONENT + octave))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,9 +114,8 @@ class Statistics(ByValue, Listed):
         Σ ln NEES of the same; a NEES of 0 (a run that starts without error) adds the logarithm of the smallest normal number.
     coverage : ndarray (m, 6, 3) of int
         Number of runs with |e_i| ≤ k √P_ii, k = 1, 2, 3.
-    histogram : ndarray (m, 9, BINS) of int
-        Counts of |e| (columns 0–5) in bin ``bin_of(|e|, ERROR_EXPONENT)``, of the three NEES (columns 6–8) in bin
-        ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` shifts the double's bits, so no logarithm is needed.
+    histogram : ndarray (m, 6, BINS) of int
+        Counts of |e| in bin ``bin_of(|e|)``, which shifts the double's bits, so no logarithm is needed.
     nis_edges : ndarray (k + 1,)
         Edges of the time bins of the NIS, s.
     sensors : tuple of str
@@ -377,7 +371,7 @@ class Statistics(ByValue, Listed):
         ndarray (m, 6)
             Quantiles, rad and rad/s.
         """
-        quantile = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
+        quantile = _quantile(self.histogram, probability, bin_edges())
         return np.asarray(np.where(np.isnan(self.mean_error), np.nan, quantile))
 
 
@@ -393,7 +387,7 @@ class Layout(NamedTuple):
 
 
 _ERROR, _PRODUCT = "rad (columns 0-2), rad/s (columns 3-5)", "rad^2, rad^2/s, (rad/s)^2"
-_RUNS = "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents"
+_RUNS = "runs by epoch, absolute error and bin; see bins_per_octave and first_error_exponent"
 ARRAYS = {
     "time": Layout(("epochs",), "epochs", "s"),
     "finite": Layout(("epochs",), "runs whose error and covariance are finite numbers, by epoch", counts=True),
@@ -405,7 +399,7 @@ ARRAYS = {
     ),
     "log_nees_sum": Layout(("epochs", 3), "sum over runs of the natural logarithm of the same"),
     "coverage": Layout(("epochs", 6, 3), "runs whose error lies inside 1, 2, 3 sigma, by epoch and state", counts=True),
-    "histogram": Layout(("epochs", 9, BINS), _RUNS, counts=True),
+    "histogram": Layout(("epochs", 6, BINS), _RUNS, counts=True),
     "nis_edges": Layout(("edges",), "edges of the spans of time of the NIS", "s"),
     "sensor_nis_sum": Layout(("sensors", "spans"), "sum over runs of the NIS, by sensor and span of time"),
     "sensor_degrees": Layout(("sensors", "spans"), "sum over runs of its degrees of freedom", counts=True),
