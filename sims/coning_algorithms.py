@@ -147,38 +147,11 @@ def exact_step(table: Algorithm, window: Sequence[Vector]) -> Vector:
         return exponential(combination([1, 1], [whole, cross(others, window[-1])]))
     if table.solver == "pairs":
         return exponential(combination([1, 1], [whole, pair_sum(table.products, window)]))
-    if table.solver == "euler":
-        return unit((mp.mpf(1), *(x / 2 for x in whole)))
     powers = rate_powers(window, p)
     if table.solver == "polynomial":
         q = polynomial_step(powers, n)
         return multiply(q, exponential(pair_sum(table.correction, window))) if any(map(any, table.correction)) else q
-    return runge_kutta_step(powers, n) if table.solver == "runge-kutta-4" else magnus_step(powers, n)
-
-
-def unit(q: Vector) -> Vector:
-    """Return q / |q|."""
-    norm = mp.sqrt(sum(x * x for x in q))
-    return tuple(x / norm for x in q)
-
-
-def runge_kutta_step(powers: Sequence[Vector], samples: int) -> Vector:
-    """Return the classical Runge–Kutta step over ``samples`` intervals on a rate polynomial, normalised."""
-    n = samples
-    rates = [combination([(mp.mpf(n) * f) ** k for k in range(len(powers))], powers) for f in (0, mp.mpf(1) / 2, 1)]
-    identity = (mp.mpf(1), mp.mpf(0), mp.mpf(0), mp.mpf(0))
-
-    def slope(q: Vector, w: Vector) -> Vector:
-        return tuple(n * x / 2 for x in multiply(q, (0, *w)))
-
-    def moved(k: Vector, h: Any) -> Vector:
-        return tuple(a + h * b for a, b in zip(identity, k, strict=True))
-
-    k1 = slope(identity, rates[0])
-    k2 = slope(moved(k1, mp.mpf(1) / 2), rates[1])
-    k3 = slope(moved(k2, mp.mpf(1) / 2), rates[1])
-    k4 = slope(moved(k3, 1), rates[2])
-    return unit(tuple(o + (a + 2 * b + 2 * c + d) / 6 for o, a, b, c, d in zip(identity, k1, k2, k3, k4, strict=True)))
+    return magnus_step(powers, n)
 
 
 def magnus_step(powers: Sequence[Vector], samples: int) -> Vector:

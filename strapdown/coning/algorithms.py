@@ -24,8 +24,6 @@ SOLVERS = {
     "pairs": "rotation vector with all cross products",
     "polynomial": "quaternion equation solved to rounding on the rate polynomial",
     "magnus-6": "one exponential of three moments",
-    "runge-kutta-4": "classical Runge–Kutta on the quaternion",
-    "euler": "first-order update of the quaternion, normalised",
 }
 """Methods by which the rotation of a step is computed from its increments."""
 
@@ -62,7 +60,7 @@ class Algorithm:
     products : tuple of tuples of Fraction
         Coefficients K_ij of all products Δθ_i × Δθ_j, i < j, in a step, over the window: a pair table (see ``coefficients``). The pairs
         solver computes φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, the compressed one also, from products with the last increment only. The
-        polynomial solver adds to its solution what K exceeds that solution's own products by. Those of the other solvers are their own.
+        polynomial solver adds to its solution what K exceeds that solution's own products by. Those of magnus-6 are its own.
     source : str, default ""
         Publication.
     """
@@ -94,9 +92,7 @@ class Algorithm:
             raise InputError(
                 f"{self.name}: the compressed solver uses products with the last increment of the step only; use solver 'pairs'"
             )
-        if self.solver not in ("compressed", "pairs", "polynomial") and table != exact.scheme_products(
-            self.solver, self.samples
-        ):
+        if self.solver == "magnus-6" and table != exact.magnus_products(self.samples):
             raise InputError(f"{self.name}: the products of solver {self.solver!r} are given by its increments alone")
 
     @classmethod
@@ -371,10 +367,11 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
     )
 
 
-def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Algorithm:
-    """Return an integrator of the quaternion equation for smooth rates, on the rate polynomial through the increments of a step."""
-    products = exact.scheme_products(solver, samples)
-    return Algorithm(name=name, solver=solver, samples=samples, order=order, products=products, source=source)
+def magnus() -> Algorithm:
+    """Return the sixth-order Magnus step, from moments of the rate polynomial through the four increments of a step."""
+    name, products = "magnus-6", exact.magnus_products(4)
+    source = "Blanes, Casas, Ros 2000"
+    return Algorithm(name=name, solver=name, samples=4, order=6, products=products, source=source)
 
 
 def _fitted_order(samples: int) -> int:
@@ -418,12 +415,7 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
     for n in range(2, 9):
         makers[f"polynomial-{n}"] = functools.partial(polynomial, n)
     makers |= {
-        # From moments of the polynomial.
-        "magnus-6": functools.partial(scheme, "magnus-6", "magnus-6", 4, 6, "Blanes, Casas, Ros 2000"),
-        # From equation (17), with rates at 0, T/2, T.
-        "runge-kutta-4": functools.partial(scheme, "runge-kutta-4", "runge-kutta-4", 3, 4, "Kutta 1901"),
-        # q + ½ q ⊗ Δθ, normalised, as in many small projects.
-        "quaternion-euler": functools.partial(scheme, "quaternion-euler", "euler", 1, 2, "Euler 1768"),
+        "magnus-6": magnus,
         "matched-2-8": functools.partial(matched, 2, 8),
         "matched-4-11": functools.partial(matched, 4, 11),
         "matched-1-4-4": functools.partial(matched, 1, 4, 4),

@@ -156,18 +156,10 @@ def sum_of_tables(a: Table, b: Table) -> Table:
 
 
 @functools.cache
-def scheme_weights(solver: str, samples: int) -> Table:
-    """Return the weights of the increments in what a one-step scheme takes from the rate polynomial of a step, T = N intervals.
-
-    For ``"runge-kutta-4"`` T times the rates at 0, T/2 and T; for the others the moments ``B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt``, n = 0, 1, 2.
-    """
+def magnus_moments(samples: int) -> Table:
+    """Return the weights of the increments in the moments ``B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt``, n = 0, 1, 2, of a step, T = N intervals."""
     half = Fraction(samples, 2)
     centred = rates_about(samples, half)
-    if solver == "runge-kutta-4":
-        return tuple(
-            tuple(samples * sum((c * t**power for power, c in enumerate(rate)), Fraction(0)) for rate in centred)
-            for t in (-half, Fraction(0), half)
-        )
     moments = [[half ** (k + 1) * (1 - (-1) ** (k + 1)) / (k + 1) for k in range(n, n + samples)] for n in range(3)]
     return tuple(
         tuple(sum(map(operator.mul, rate, moment), Fraction(0)) / samples**n for rate in centred)
@@ -175,19 +167,13 @@ def scheme_weights(solver: str, samples: int) -> Table:
     )
 
 
-def scheme_products(solver: str, samples: int) -> Table:
-    """Return the pair table of a one-step scheme."""
-    weights = scheme_weights(solver, samples)
-    if solver == "euler":
-        return ((Fraction(0),) * samples,) * samples
-    if solver == "runge-kutta-4":
-        # Twice the vector part of the step quaternion has the products T²/12 (w₀ × w_½ + w_½ × w₁).
-        start, middle, end = weights
-        both = sum_of_tables(outer_pairs(start, middle), outer_pairs(middle, end))
-        return tuple(tuple(x / 12 for x in row) for row in both)
-    # magnus-6: α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
-    left = tuple((30 * x - 120 * z) / 240 for x, z in zip(weights[0], weights[2], strict=True))
-    return outer_pairs(left, tuple(12 * y for y in weights[1]))
+def magnus_products(samples: int) -> Table:
+    """Return the pair table of the sixth-order Magnus step: (20 α₁ + α₃) × α₂ / 240.
+
+    α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂.
+    """
+    b0, b1, b2 = magnus_moments(samples)
+    return outer_pairs(tuple((30 * x - 120 * z) / 240 for x, z in zip(b0, b2, strict=True)), tuple(12 * y for y in b1))
 
 
 def second_order(pairs: Table, samples: int, previous: int = 0) -> int:

@@ -27,7 +27,6 @@ from strapdown.kernels.machine import compiled
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 _VECTOR_SOLVERS = ("compressed", "pairs")
-_SCHEMES = {"magnus-6": kernels.MAGNUS_6, "runge-kutta-4": kernels.RUNGE_KUTTA_4, "euler": kernels.EULER}
 
 EVEN = 1e-3
 """Maximum relative deviation of an interval from the mean of its window for which the intervals are treated as equal: the rounding of
@@ -231,8 +230,7 @@ def _steps(increments: Array, table: Algorithm) -> Array:
             increments, table.samples, previous, _fits(window), correction, rates, series, steps
         )
         return steps
-    weights = exact.floats(exact.scheme_weights(table.solver, table.samples))
-    compiled(kernels.scheme_steps)(increments, weights, _SCHEMES[table.solver], steps)
+    compiled(kernels.magnus_steps)(increments, exact.floats(exact.magnus_moments(table.samples)), steps)
     return steps
 
 

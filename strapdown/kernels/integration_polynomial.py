@@ -1,4 +1,4 @@
-"""Solution of q̇ = ½ q ⊗ w for a rate polynomial: to rounding by a power series, or by Magnus, Runge–Kutta, Euler."""
+"""Solution of q̇ = ½ q ⊗ w for a rate polynomial: to rounding by a power series, or by the Magnus expansion."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from strapdown.kernels.algebra import (
     combine,
     combine_matrices,
     cross,
-    dot,
     scale_matrix,
-    square_root,
 )
 from strapdown.kernels.integration import large_exponential, pair_correction
 from strapdown.kernels.measurement import quaternion_at, vector_at
-from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
+from strapdown.kernels.rotation import quaternion_multiply, renormalized
 from strapdown.kernels.state import store_row
 
 NEGLIGIBLE = 2.0**-56
@@ -28,10 +26,6 @@ TERMS_PER_SAMPLE = 2
 
 EXTRA_TERMS = 24
 """At a constant rate of ``LARGEST_RATE`` the terms decrease as 1/n!, to below rounding at n = 18."""
-
-MAGNUS_6 = 0
-RUNGE_KUTTA_4 = 1
-EULER = 2
 
 
 def quaternion_times_vector(q, v):
@@ -169,29 +163,6 @@ def magnus_6(b0, b1, b2):
     )
 
 
-def runge_kutta_4(start, middle, end):
-    """Return the classical Runge–Kutta step of equation (17), normalised; the arguments are T × rate at 0, T/2, T."""
-    k1 = (0.0, 0.5 * start[0], 0.5 * start[1], 0.5 * start[2])
-    k2 = quaternion_times_vector((0.5 + 0.25 * k1[0], 0.25 * k1[1], 0.25 * k1[2], 0.25 * k1[3]), middle)
-    k3 = quaternion_times_vector((0.5 + 0.25 * k2[0], 0.25 * k2[1], 0.25 * k2[2], 0.25 * k2[3]), middle)
-    k4 = quaternion_times_vector((0.5 + 0.5 * k3[0], 0.5 * k3[1], 0.5 * k3[2], 0.5 * k3[3]), end)
-    s = 1.0 / 6.0
-    return unit(
-        (
-            1.0 + s * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
-            s * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1]),
-            s * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2]),
-            s * (k1[3] + 2.0 * (k2[3] + k3[3]) + k4[3]),
-        )
-    )
-
-
-def euler(increment):
-    """Return 1 + ½ Δθ, normalised."""
-    s = 1.0 / square_root(1.0 + 0.25 * dot(increment, increment))
-    return (s, 0.5 * s * increment[0], 0.5 * s * increment[1], 0.5 * s * increment[2])
-
-
 def weighted(increments, first, weights, row):
     """Return Σ_j weights[row, j] Δθ_j over the window that starts at row ``first``."""
     total = (0.0, 0.0, 0.0)
@@ -200,18 +171,12 @@ def weighted(increments, first, weights, row):
     return total
 
 
-def scheme_steps(increments, weights, scheme, steps):
-    """Write the step quaternions (m, 4) of a one-step scheme on three weighted sums (moments or rates) of the N increments of a step."""
+def magnus_steps(increments, weights, steps):
+    """Write the step quaternions (m, 4) of :func:`magnus_6` on the moments, weighted sums of the N increments of a step."""
     samples = weights.shape[1]
     for k in range(len(steps)):
         first = k * samples
-        a = weighted(increments, first, weights, 0)
-        b = weighted(increments, first, weights, 1)
-        c = weighted(increments, first, weights, 2)
-        if scheme == MAGNUS_6:
-            q = magnus_6(a, b, c)
-        elif scheme == RUNGE_KUTTA_4:
-            q = runge_kutta_4(a, b, c)
-        else:
-            q = euler(a)
-        store_row(steps, k, renormalized(q))
+        b0 = weighted(increments, first, weights, 0)
+        b1 = weighted(increments, first, weights, 1)
+        b2 = weighted(increments, first, weights, 2)
+        store_row(steps, k, renormalized(magnus_6(b0, b1, b2)))
