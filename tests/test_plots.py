@@ -137,14 +137,7 @@ def test_a_line_of_an_angle_breaks_where_it_wraps(turns):
         assert jumps.mean() > 0.4
 
 
-def test_a_distribution_has_its_quantiles_and_leaves_out_what_is_missing():
-    ax = plots.error_distribution(np.array([3.0, np.nan, 1.0, 2.0, 4.0]) * units.DEGREE)
-    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1.0, 25.0], [2.0, 50.0], [3.0, 75.0], [4.0, 100.0]])
-    assert [text.get_text() for text in ax.texts] == ["50 %: 2 °", "95 %: 4 °"]
-
-
-def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, monkeypatch):
-    monkeypatch.setattr(plots.innovations, "WINDOW", 7)
+def test_nees_and_nis_are_drawn_with_their_bounds(statistics):
     degrees = np.median(statistics.sensor_degrees.sum(axis=0))
     span = plots.nis_over_time([("filter", statistics)]).patches[0]
     bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
@@ -153,18 +146,6 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, mo
     with pytest.raises(InputError, match="did you mean 'attitude'"):
         plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "atitude")
     np.testing.assert_allclose(nees, statistics.nees_sum[:, 2] / (3.0 * 24.0))
-    innovations = next(iter(run[0].innovations.values()))
-    nis = np.sum(innovations.whitened**2, axis=1) / 2.0
-    each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0)).lines
-    np.testing.assert_allclose(each.get_ydata(), np.maximum(nis, 1e-4))
-    for k in (0, 5):  # each mean at the middle of its window
-        assert mean.get_xdata()[k] == pytest.approx(innovations.time[k : k + 7].mean())
-        assert mean.get_ydata()[k] == pytest.approx(nis[k : k + 7].mean())
-    n, lags = len(nis), 3
-    lines = plots.innovation_autocorrelation(consistency.autocorrelation(innovations.whitened, lags)).lines[:4]
-    spread = np.sqrt((n - np.arange(1, lags + 1)) / (n * (n + 2.0)))
-    for line, sign, outside in zip(lines, (1.0, -1.0) * 2, (0.005, 0.005, 0.005 / 6, 0.005 / 6), strict=True):
-        np.testing.assert_allclose(line.get_ydata(), sign * scipy.stats.norm.isf(outside) * spread)
 
 
 @pytest.mark.parametrize("start", [2e-4, 1e-9])
@@ -211,12 +192,6 @@ def test_coning_errors_are_those_about_the_cones_axis(outcomes):
         np.testing.assert_allclose(ax.lines[1].get_ydata() * size, held.example_error[0, :, state])
         top = heights(ax.collections[0]).max()
         assert top * size == pytest.approx(3.0 * held.sigma[:, state].max())
-
-
-def test_the_histogram_counts_what_lies_beyond():
-    white = np.concatenate([np.zeros(100), [9.0, -7.0]])[:, None]
-    ax = plots.innovation_histogram(white)
-    assert any("2 beyond" in text.get_text() for text in ax.get_legend().get_texts())
 
 
 @pytest.mark.parametrize("epoch", [0, -1])

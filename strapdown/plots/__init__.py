@@ -5,7 +5,6 @@ Colours are those of Okabe and Ito, distinguishable with colour vision deficienc
 - ``style``: Colours, sizes, saving.
 - ``decimation``: Reduction of long series to the extremes of each pixel column.
 - ``estimates``: One estimate over time: attitude, bias, σ, errors.
-- ``innovations``: Innovations of one record: NIS, distribution, autocorrelation.
 - ``statistics``: Error statistics over many runs.
 - ``coning``: The coning study.
 - ``allan``: Allan deviations with fits.
@@ -33,12 +32,6 @@ from strapdown.plots.estimates import (
     estimate_overview,
     recording_errors,
     states_over_time,
-)
-from strapdown.plots.innovations import (
-    error_distribution,
-    innovation_autocorrelation,
-    innovation_histogram,
-    nis_over_record,
 )
 from strapdown.plots.statistics import (
     covariance_ellipses,

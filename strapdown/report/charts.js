@@ -1,6 +1,7 @@
 "use strict";
 // Interactive charts: drag to zoom, double click to see all, hover to read, keys as in HELP. Charts over time share cursor and zoom.
 (function () {
+  const TIME = "time, s"; // the axis along which the body turns
   const HELP = "Keys: plus and minus zoom, left and right arrow move, 0 shows all.";
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const MISSING = -32768;
@@ -90,7 +91,7 @@
           })),
         ],
         bands,
-        hooks: { setSelect: [(u) => { u.zoomed = true; }], setCursor: [(u) => { if (!named) turn(u.posToVal(u.cursor.left, "x"), u.cursor.left); }] },
+        hooks: { setSelect: [(u) => { u.zoomed = true; }], setCursor: [(u) => { if (content.x === TIME) turn(u.posToVal(u.cursor.left, "x"), u.cursor.left); }] },
       },
       content.columns,
       place

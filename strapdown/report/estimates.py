@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, quaternion, records, workflows
+from strapdown import consistency, quaternion, records, workflows
 from strapdown.checks import Array
 from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
@@ -17,6 +16,11 @@ from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import page
 from strapdown.units import DEGREE, angle_unit, rate_unit
+
+REACH = 5.0
+"""Range of the distribution of whitened innovations, ±σ; those beyond it are in the outermost bins."""
+WINDOW = 50
+"""Number of measurements of the moving average of the NIS."""
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -107,33 +111,52 @@ def _estimate_charts(estimate: Estimate) -> list[str]:
 
 
 def _sensor(name: str, innovations: Innovations) -> str:
+    """Return charts of the whitened innovations of a sensor: distribution, autocorrelation, and NIS over time."""
     title, number = f"Innovations of {name}", len(innovations.time)
     if number < 8:
         return page.section(title, page.paragraph(f"{number} measurements are too few to draw."))
     white = innovations.whitened
-
-    def draw() -> Figure:
-        figure, axes = plots.new_figure(3, 1, size=(9.0, 9.0))
-        plots.innovation_histogram(white, axes[0])
-        plots.innovation_autocorrelation(consistency.autocorrelation(white), axes[1])
-        plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[2])
-        return figure
-
+    bins = int(np.clip(np.sqrt(white.size), 12, 80))
+    density, edges = np.histogram(np.clip(white, -REACH, REACH), bins, (-REACH, REACH), density=True)
+    at = 0.5 * (edges[1:] + edges[:-1])
+    shape = [
+        page.Series(label="innovations", value=density),
+        page.Series(
+            label="standard normal", value=np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), colour="--b", dash=True
+        ),
+    ]
+    found = consistency.autocorrelation(white)
+    bounds = found.simultaneous_bounds
+    lags = page.band(-bounds, bounds, ("99 % bounds, all lags", "lower bound"))
+    lags += [
+        page.Series(label=AXES[k] if found.values.shape[1] > 1 else "innovations", value=value, colour=page.COLOURS[k])
+        for k, value in enumerate(found.values.T)
+    ]
+    nis, (low, high) = innovations.nis / white.shape[1], consistency.mean_bounds(white.shape[1], 1)
+    course = page.band(np.full(number, low), np.full(number, high), ("99 % bounds, each", "lower bound"))
+    course.append(page.Series(label="one measurement", value=np.maximum(nis, 1e-4)))
+    if number >= 2 * WINDOW:
+        mean = np.full(number, np.nan)
+        first = WINDOW // 2
+        mean[first : first + number - WINDOW + 1] = np.convolve(nis, np.full(WINDOW, 1.0 / WINDOW), mode="valid")
+        course.append(page.Series(label=f"mean of {WINDOW}", value=mean, colour="--b"))
     return page.section(
-        title, page.figure(draw, f"{title} divided by their σ: distribution, autocorrelation, NIS over time")
+        title,
+        page.chart("Innovations over their σ", "density", at, shape, x="innovation over its σ"),
+        page.chart("Autocorrelation", "autocorrelation", found.lags, lags, x="lag, measurements"),
+        page.chart("NIS over time", "NIS per degree of freedom", innovations.time, course, log=True),
     )
 
 
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
+    """Return a chart of the cumulative distribution of the total attitude error over time; none without a truth."""
     if truth is None:
         return []
     known = truth.known
-    angle = quaternion.angle_between(estimate.attitude[known], truth.attitude[known])
-
-    def draw() -> Figure:
-        figure, ax = plots.new_figure(size=(6.5, 4.2))
-        plots.error_distribution(angle, ax)
-        return figure
-
-    caption = "Cumulative distribution of the total attitude error over time"
-    return [page.section("Attitude", page.figure(draw, caption))]
+    angle = np.sort(quaternion.angle_between(estimate.attitude[known], truth.attitude[known])) / DEGREE
+    share = 100.0 * np.arange(1, len(angle) + 1) / len(angle)
+    line = page.Series(label="fraction of the time with at most this error", value=share)
+    title = f"Total attitude error: median {np.median(angle):.3g}°, 95 % of the time at most {np.quantile(angle, 0.95):.3g}°"
+    return [
+        page.section("Attitude", page.chart(title, "fraction of the time, %", angle, [line], x="attitude error, °"))
+    ]
