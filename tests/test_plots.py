@@ -194,16 +194,6 @@ def test_coning_errors_are_those_about_the_cones_axis(outcomes):
         assert top * size == pytest.approx(3.0 * held.sigma[:, state].max())
 
 
-@pytest.mark.parametrize("epoch", [0, -1])
-def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
-    ax = plots.coverage_by_state(statistics, epoch)
-    drawn = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 6]
-    np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
-    for k, span in enumerate(ax.patches, start=1):
-        ends = scipy.stats.binom.ppf([0.005, 0.995], 24, 2.0 * scipy.stats.norm.cdf(k) - 1.0) / 24
-        np.testing.assert_allclose(limits(span), 100.0 * ends, rtol=1e-9)
-
-
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
     with pytest.raises(InputError, match="truth is None"):
@@ -262,22 +252,6 @@ def test_drifts_that_are_rounding_are_reported_and_not_drawn():
         assert sum(np.isfinite(bar.get_height()) for bar in ax.patches) == len(shown) - 2
 
 
-def test_the_ellipse_holds_its_share():
-    random = np.random.default_rng(1)
-    factor = np.array([[1.0, 0.0], [0.7, 0.4]])
-    claimed = np.zeros((6, 6))
-    claimed[:2, :2] = factor @ factor.T
-    ax = plots.covariance_ellipses(claimed, claimed, (0, 1))
-    ellipse = ax.patches[0]
-    points = (factor @ random.standard_normal((2, 20_000))).T / units.DEGREE
-    inside = ellipse.contains_points(ax.transData.transform(points))
-    assert inside.mean() == pytest.approx(0.95, abs=0.01)
-    edge = ax.transData.inverted().transform(ellipse.get_transform().transform_path(ellipse.get_path()).vertices)
-    for (low, high), axis in zip((ax.get_xlim(), ax.get_ylim()), edge.T, strict=True):
-        assert low == -high
-        assert axis.max() < high < 2.0 * axis.max()  # all of it is seen
-
-
 @pytest.mark.parametrize("look", ["default", "dark_background"])
 def test_ink_stands_apart_from_the_ground_of_a_style(look, statistics):
     with matplotlib.style.context(look):
@@ -326,7 +300,6 @@ def figures(run, statistics, outcomes):
         "estimate": plots.estimate_overview(estimate, title="record.h5"),
         "states": plots.states_over_time(with_states, title="record.h5"),
         "coning consistency": plots.coning_consistency(outcomes),
-        "coverage": plots.coverage_by_state(statistics).figure,
         "runs": plots.runs_overview(statistics),
     }
 
@@ -463,14 +436,6 @@ def test_angle_units_are_those_that_are_read_best():
     assert units.angle_unit(np.array([0.1, np.nan]))[0] == "°"
     assert units.rate_unit(np.array([1e-6]))[0] == "°/h"
     assert units.rate_unit(np.array([0.1]))[0] == "°/s"
-
-
-def test_axes_beside_each_other_are_in_one_unit():
-    """Of attitude errors of which one is large none is printed in arcseconds."""
-    P = np.diag([1e-5, 1e-5, 1e-1, 1e-7, 1e-7, 1e-2]) ** 2
-    ax = plots.covariance_ellipses(P, P, (0, 2))
-    assert ax.get_xlabel().endswith(", °")
-    assert ax.get_ylabel().endswith(", °")
 
 
 def test_a_name_that_the_font_lacks_makes_no_noise(tmp_path, recwarn):

@@ -34,8 +34,6 @@ from strapdown.plots.estimates import (
     states_over_time,
 )
 from strapdown.plots.statistics import (
-    covariance_ellipses,
-    coverage_by_state,
     nees_over_time,
     nis_over_time,
     runs_overview,

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
-from strapdown.checks import Array, one_of
+from strapdown.checks import one_of
 from strapdown.consistency import mean_bounds
-from strapdown.consistency.bounds import COVERED
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.plots import style
-from strapdown.units import angle_unit, rate_unit
 
 BOUNDS = "bounds of a consistent filter"
 
@@ -90,10 +86,6 @@ def nis_over_time(
     return ax
 
 
-STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in style.AXES)
-"""Names of the six states of the error (δθ, δb)."""
-
-
 def runs_overview(statistics: Statistics) -> Figure:
     """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the tested epochs."""
     figure, axes = style.new_figure(1, 3, size=(10.5, 4.2))
@@ -116,59 +108,3 @@ def runs_overview(statistics: Statistics) -> Figure:
         axes[2].set_visible(False)
     style.legend_below(figure, [ax for ax in axes if ax.get_visible()], ncols=4)
     return figure
-
-
-def state_unit(state: int, value: Array) -> tuple[str, float]:
-    """Return the unit in which an error of a state (0 to 5) of this magnitude is printed."""
-    return angle_unit(value) if state < 3 else rate_unit(value)
-
-
-def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None = None) -> Axes:
-    """Draw the fraction of the runs within 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a consistent filter."""
-    from scipy.stats import binom
-
-    ax = style.axes_or_new(ax)
-    runs = int(statistics.finite[epoch])
-    for k, expected in enumerate(COVERED):
-        low, high = binom.ppf([0.005, 0.995], runs, expected) / runs
-        ax.axhspan(100 * low, 100 * high, color=style.CYCLE[k], alpha=0.2, linewidth=0)
-        words = f"within {k + 1}σ, expected {100 * expected:.1f} %"
-        ax.plot(range(6), 100 * statistics.covered[epoch, :, k], "o", color=style.CYCLE[k], label=words)
-    ax.set_xticks(range(6), STATES, rotation=20)
-    ax.grid(visible=False, axis="x")
-    ax.plot([], [], color=style.ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
-    ax.set_ylim(0.0, 104.0)
-    ax.set_ylabel(f"fraction of {runs} runs, %")
-    style.legend_above(ax, ncols=2)
-    return ax
-
-
-def covariance_ellipses(claimed: Array, actual: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None) -> Axes:
-    """Draw the 95 % ellipses of the errors of two states: by the filter's covariance, and of the actual errors."""
-    from scipy.stats import chi2
-
-    ax = style.axes_or_new(ax)
-    i, j = pair
-    largest = np.sqrt(max(claimed[i, i], actual[i, i])), np.sqrt(max(claimed[j, j], actual[j, j]))
-    alike = i // 3 == j // 3  # two angles, or two rates: the same unit
-    (unit_i, size_i), (unit_j, size_j) = (
-        state_unit(s, 3.0 * np.array(largest if alike else [x])) for s, x in zip(pair, largest, strict=True)
-    )
-    scale = np.array([size_i, size_j])
-    reach = float(np.sqrt(chi2.ppf(0.95, 2)))
-    styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
-        ("filter", claimed, {"edgecolor": style.VERMILION, "linewidth": 2.0}),
-        ("actual errors", actual, {"edgecolor": style.ink(), "linewidth": 1.2, "linestyle": "--"}),
-    )
-    for name, matrix, look in styles:
-        P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)
-        value, vector = np.linalg.eigh(P)
-        axes = 2.0 * reach * np.sqrt(np.maximum(value, 0.0))
-        angle = float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0])))
-        ax.add_patch(Ellipse((0.0, 0.0), *axes, angle=angle, facecolor="none", label=name, **look))
-    spread = 1.25 * reach * np.array(largest) / scale
-    ax.set(xlim=(-spread[0], spread[0]), ylim=(-spread[1], spread[1]))
-    ax.set(xlabel=f"{STATES[i]} error, {unit_i}", ylabel=f"{STATES[j]} error, {unit_j}")
-    ax.set_title("95 % ellipses", loc="left")
-    style.legend_above(ax)
-    return ax

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, records, workflows
+from strapdown import consistency, records, workflows
 from strapdown.checks import Array, Hint, InputError
+from strapdown.consistency.bounds import COVERED
+from strapdown.consistency.judgement import state_name
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
-from strapdown.plots.statistics import STATES, state_unit
 from strapdown.report import page
 from strapdown.results import Table
+from strapdown.units import angle_unit, rate_unit
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -28,7 +31,6 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     judgement = workflows.check(held)
     bound = verdicts.bound_of(held.plan)
     numbers = verdicts.summary(statistics, judgement=judgement, bound=bound)
-    ending = "σ-coverage by state, and the covariance of the errors and of the filter"
     parts = [page.paragraph(f"{table.title}:") + "\n" + page.table(table) for table in verdicts.tables(numbers)]
     name = held.plan.scenario.name or "a scenario"
     shown = {k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}
@@ -39,7 +41,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.section("Evidence", page.table(judgement.listing())),
         page.section("Key numbers", *parts),
         page.section("Over time", *_over_time(statistics, judgement)),
-        page.section("At the end", page.figure(lambda: _end(statistics), ending)),
+        page.section("At the end", *_end(statistics)),
         _worst(statistics, path),
         page.section("Provenance", page.provenance(shown)),
     )
@@ -63,7 +65,12 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
 
 def _estimated(statistics: Statistics) -> tuple[str, ...]:
     """Return the names of the states that the filter estimates."""
-    return STATES if statistics.has_bias else STATES[:3]
+    return tuple(map(state_name, range(6 if statistics.has_bias else 3)))
+
+
+def _unit(state: int, value: Array) -> tuple[str, float]:
+    """Return the unit in which an error of a state (0 to 5) of this magnitude is printed."""
+    return angle_unit(value) if state < 3 else rate_unit(value)
 
 
 def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:
@@ -82,7 +89,7 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
     settled = slice(len(statistics.time) // 20, None)
     for k, name in enumerate(_estimated(statistics)):
         sigma = statistics.sigma[:, k]
-        unit, size = state_unit(k, 3.0 * statistics.sigma[settled, k // 3 * 3 : k // 3 * 3 + 3])
+        unit, size = _unit(k, 3.0 * statistics.sigma[settled, k // 3 * 3 : k // 3 * 3 + 3])
         quantiles, predicted = [], []
         for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c")):
             words, value = f"{100 * share:g} %", statistics.error_quantile(share)[:, k] / size
@@ -104,15 +111,52 @@ def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tu
     return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
 
 
-def _end(statistics: Statistics) -> Figure:
-    figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
-    plots.coverage_by_state(statistics, -1, axes[0])
+def _end(statistics: Statistics) -> list[str]:
+    """Return charts of the σ-coverage by state at the last epoch, and of the ellipses of the filter's and of the actual errors."""
+    from scipy.stats import binom
+
+    names, runs = _estimated(statistics), int(statistics.finite[-1])
+    places, shares = np.arange(float(len(names))), []
+    for k, expected in enumerate(COVERED):
+        low, high = 100.0 * binom.ppf([0.005, 0.995], runs, expected) / runs
+        shares += page.band(
+            np.full(len(names), low), np.full(len(names), high), (f"99 % bounds, {k + 1}σ", "lower bound")
+        )
+        words = f"within {k + 1}σ, expected {100.0 * expected:.1f} %"
+        covered = 100.0 * statistics.covered[-1, : len(names), k]
+        shares.append(page.Series(label=words, value=covered, colour=page.COLOURS[k]))
+    title = "σ-coverage by state, with the bounds of a consistent filter"
+    charts = [page.chart(title, f"fraction of {runs} runs, %", places, shares, x="state", ticks=names)]
+    claimed, actual = statistics.covariance[-1], statistics.mean_square_error[-1]
     # The bias axis with the largest ratio between actual and filter variance, with the attitude about it.
-    ratio = np.diag(statistics.mean_square_error[-1]) / np.diag(statistics.covariance[-1])
-    worst = int(np.argmax(np.abs(np.log(np.maximum(ratio[3:], 1e-300)))))
-    for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst) if statistics.has_bias else (0, 2)), strict=True):
-        plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], pair, ax)
-    return figure
+    ratio = np.diag(actual)[3:] / np.diag(claimed)[3:]
+    worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, 1e-300))))) if statistics.has_bias else 0
+    for pair in ((0, 1), (worst, 3 + worst) if statistics.has_bias else (0, 2)):
+        charts.append(_ellipses(names, claimed[np.ix_(pair, pair)], actual[np.ix_(pair, pair)], pair))
+    return charts
+
+
+def _ellipses(names: Sequence[str], claimed: Array, actual: Array, pair: tuple[int, int]) -> str:
+    """Return a chart of the 95 % ellipses of the errors of two states: by the filter's covariance (2, 2), and of the actual errors."""
+    largest = np.sqrt(np.maximum(np.diag(claimed), np.diag(actual)))
+    alike = pair[0] // 3 == pair[1] // 3  # two angles, or two rates: the same unit
+    (unit, size), (unit_up, size_up) = (
+        _unit(state, 3.0 * (largest if alike else largest[[k]])) for k, state in enumerate(pair)
+    )
+    square = -2.0 * math.log(0.05)  # 95 % quantile of χ² with two degrees of freedom
+    x = np.linspace(-1.0, 1.0, 401) * math.sqrt(square) * largest[0]
+
+    def ends(P: Array) -> tuple[Array, Array]:
+        """Return lower and upper end at each x of eᵀP⁻¹e = square, NaN beyond."""
+        slope = P[0, 1] / P[0, 0]
+        left = square - x**2 / P[0, 0]
+        half = np.sqrt(np.where(left >= 0.0, left, np.nan) * max(P[1, 1] - slope * P[0, 1], 0.0))
+        return (slope * x - half) / size_up, (slope * x + half) / size_up
+
+    lines = page.band(*ends(claimed), ("filter", "its lower side"))
+    lines += page.band(*ends(actual), ("actual errors", "their lower side"), colour="--b", dash=True)
+    title = f"95 % ellipses: {names[pair[1]]} over {names[pair[0]]}"
+    return page.chart(title, f"{names[pair[1]]} error, {unit_up}", x / size, lines, x=f"{names[pair[0]]} error, {unit}")
 
 
 def _worst(statistics: Statistics, path: Path) -> str:

@@ -5,23 +5,19 @@ from __future__ import annotations
 import base64
 import html
 import importlib.resources
-import io
 import json
 import re
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
-from strapdown.plots import style
 from strapdown.plots.decimation import extreme_rows
 from strapdown.plots.estimates import wraps
 from strapdown.results import Table
@@ -31,9 +27,6 @@ if TYPE_CHECKING:
 
 CHART_SAMPLES = 200_000
 """Maximum number of times of an interactive chart; longer series are reduced to the extremes of each column."""
-_DOTS_PER_INCH = 120
-_WIDE = 7.0
-"""Width in inches above which a figure scrolls on a narrow page instead of shrinking."""
 
 
 COLOURS = ("--a", "--b", "--c")
@@ -122,24 +115,6 @@ def listed(content: Table) -> str:
     return section(content.title, table(content))
 
 
-def figure(draw: Callable[[], Figure], caption: str) -> str:
-    """Return a figure, drawn in the package's style."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context(style.STYLE):
-        drawn = draw()
-        drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-    return _image("image/png", buffer.getvalue(), caption, wide=drawn.get_figwidth() > _WIDE)
-
-
-def _image(kind: str, content: bytes, caption: str, *, wide: bool) -> str:
-    """Return a figure of a media type, which the style sheet turns dark in the dark theme."""
-    data = base64.b64encode(content).decode()
-    return (
-        f'<figure{" class=wide" if wide else ""}><div class="scroll" tabindex="0"><img src="data:{kind};base64,{data}" '
-        f'alt="{text(caption)}"></div><figcaption>{text(caption)}</figcaption></figure>'
-    )
-
-
 _KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
 """Media type and first bytes of the image formats that a page can show."""
 
@@ -155,7 +130,12 @@ def stored_figure(stem: Path, caption: str) -> str:
             content = reading.content(path, link=False)
             if not content.startswith(first):
                 raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
-            return section(caption, _image(kind, content, caption, wide=True))
+            data = base64.b64encode(content).decode()  # the style sheet turns it dark in the dark theme
+            return section(
+                caption,
+                f'<figure class=wide><div class="scroll" tabindex="0"><img src="data:{kind};base64,{data}" '
+                f'alt="{text(caption)}"></div><figcaption>{text(caption)}</figcaption></figure>',
+            )
     return ""
 
 
