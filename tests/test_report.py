@@ -111,8 +111,8 @@ def test_charts_of_innovations_are_those_of_their_definitions(folder, monkeypatc
     spread = np.sqrt((number - lags[0]) / (number * (number + 2.0)))
     np.testing.assert_allclose(lags[1], scipy.stats.norm.isf(0.005 / (degrees * len(lags[0]))) * spread, rtol=1e-3)
     np.testing.assert_allclose(lags[2], -lags[1], rtol=1e-3)
-    one = np.sum(white[1:] * white[:-1], axis=0) / np.sum(white**2, axis=0)
-    np.testing.assert_allclose([line[0] for line in lags[3:]], one, atol=1e-4)
+    first_lag = np.sum(white[1:] * white[:-1], axis=0) / np.sum(white**2, axis=0)
+    np.testing.assert_allclose([line[0] for line in lags[3:]], first_lag, atol=1e-4)
     np.testing.assert_allclose(course[3], nis, atol=1e-4 * nis.max())
     for k in (3, number - 4):  # each mean at the middle of its window
         assert course[4][k] == pytest.approx(nis[k - 3 : k + 4].mean(), abs=1e-3)

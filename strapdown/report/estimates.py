@@ -125,12 +125,14 @@ def _sensor(name: str, innovations: Innovations) -> str:
             label="standard normal", value=np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), colour="--b", dash=True
         ),
     ]
-    found = consistency.autocorrelation(white)
-    bounds = found.simultaneous_bounds
+    correlation = consistency.autocorrelation(white)
+    bounds = correlation.simultaneous_bounds
     lags = page.band(-bounds, bounds, ("99 % bounds, all lags", "lower bound"))
     lags += [
-        page.Series(label=AXES[k] if found.values.shape[1] > 1 else "innovations", value=value, colour=page.COLOURS[k])
-        for k, value in enumerate(found.values.T)
+        page.Series(
+            label=AXES[k] if correlation.values.shape[1] > 1 else "innovations", value=value, colour=page.COLOURS[k]
+        )
+        for k, value in enumerate(correlation.values.T)
     ]
     nis, (low, high) = innovations.nis / white.shape[1], consistency.mean_bounds(white.shape[1], 1)
     course = page.band(np.full(number, low), np.full(number, high), ("99 % bounds, each", "lower bound"))
@@ -143,7 +145,7 @@ def _sensor(name: str, innovations: Innovations) -> str:
     return page.section(
         title,
         page.chart("Innovations over their σ", "density", at, shape, x="innovation over its σ"),
-        page.chart("Autocorrelation", "autocorrelation", found.lags, lags, x="lag, measurements"),
+        page.chart("Autocorrelation", "autocorrelation", correlation.lags, lags, x="lag, measurements"),
         page.chart("NIS over time", "NIS per degree of freedom", innovations.time, course, log=True),
     )
 
