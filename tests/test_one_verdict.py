@@ -125,6 +125,42 @@ def test_a_filter_of_ones_own_by_every_way(tmp_path):
     agree(again.estimate, file)
 
 
+def test_rows_without_an_estimate_by_every_way(tmp_path):
+    """NaN, as before the first fix of a filter or after its failure; Monte Carlos write such estimates of a filter of one's own."""
+    scenario = replace(sd.scenarios.load_scenario("two-stars"), duration=60.0)
+    result = sd.estimate(sd.simulate(scenario, seed=5), every=2)
+    late, m = slice(100, None), len(result.time)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        values = getattr(result, name).copy()
+        values[:100] = np.nan
+        result = replace(result, **{name: values})
+    file = sd.write(result, tmp_path / "late.h5")
+    assert sd.read(file) == result
+    summary = agree(result, file)
+    whole = sd.check(result.taken(late)).summary()
+    assert summary["findings"] == whole["findings"]
+    assert f"no estimate at 100 of {m} times, which are not judged" in summary["limits"]
+    assert sd.accuracy(result).summary() == sd.accuracy(result.taken(late)).summary()
+    assert sd.plots.estimate_overview(result)
+    assert sd.read(sd.write(replace(result, truth=None), tmp_path / "alone.h5")) == replace(result, truth=None)
+    agree(replace(result, truth=None), tmp_path / "alone.h5")
+    partly = result.truth.bias.copy()
+    partly[:200] = np.nan
+    result = replace(result, truth=replace(result.truth, bias=partly))
+    assert (
+        agree(result, sd.write(result, tmp_path / "partly.h5"))["findings"]
+        == sd.check(result.taken(slice(200, None))).summary()["findings"]
+    )
+
+
+def test_a_truth_without_attitudes_by_every_way(tmp_path):
+    scenario = replace(sd.scenarios.load_scenario("two-stars"), duration=60.0)
+    result = sd.estimate(sd.simulate(scenario, seed=5))
+    unknown = replace(result.truth, attitude=np.full_like(result.truth.attitude, np.nan), bias=None)
+    result = replace(result, truth=unknown)
+    agree(result, sd.write(result, tmp_path / "unknown.h5"))
+
+
 def test_a_campaign_by_every_way(tmp_path):
     file = tmp_path / "c.h5"
     assert run("montecarlo", "two-stars", "--runs", 40, "--out", file) in STATUS.values()

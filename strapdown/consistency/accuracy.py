@@ -209,6 +209,8 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     truth = estimate.truth if truth is None else truth
     if truth is None:
         raise InputError("the estimate has no truth; give one")
+    if not (estimated := estimate.known).all():
+        estimate, truth = estimate.taken(estimated), truth.taken(estimated)
     known = truth.known
     if not known.any():
         raise InputError("the truth has no attitude at the estimate's times")
@@ -220,8 +222,9 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     if align:
         alignment, aligned = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
     if truth.has_bias and estimate.has_bias:
-        squares = np.sum((estimate.bias - truth.bias) ** 2, axis=1), np.sum(estimate.variance[:, 3:], axis=1)
-        bias = tuple(float(np.sqrt(np.mean(square))) for square in squares)
+        rows = np.isfinite(truth.bias).all(axis=1)
+        squares = (estimate.bias - truth.bias)[rows] ** 2, estimate.variance[rows, 3:]
+        bias = tuple(float(np.sqrt(np.mean(np.sum(square, axis=1)))) for square in squares)
     return Accuracy(given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]
 
 

@@ -293,6 +293,8 @@ def judge(
     findings: list[Finding] = []
     limits: list[str] = []
     untested: dict[str, str] = {}
+    if missing := int(np.sum(~estimate.known)):
+        limits.append(f"no estimate at {missing} of {len(estimate.time)} times, which are not judged")
     for sensor, innovations in estimate.innovations.items():
         used = innovations.used
         if used.any():
@@ -405,9 +407,11 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
             f"truth has {len(truth.attitude)} attitudes and {len(np.atleast_1d(truth.bias))} biases, the estimate {m} times; "
             "give the truth at the estimate's own times"
         )
-    has_truth = ~np.isnan(truth.attitude).all(axis=1)
+    has_truth = ~np.isnan(truth.attitude).all(axis=1) & estimate.known
+    if truth.has_bias:
+        has_truth &= np.isfinite(truth.bias).all(axis=1)
     if not has_truth.any():
-        limits.append("the reference has no attitude")
+        limits.append("the reference has no attitude at a time with an estimate")
         return []
     attitude = unit_quaternions("truth.attitude", truth.attitude[has_truth])
     e = errors(estimate.attitude[has_truth], estimate.bias[has_truth], attitude, truth.bias[has_truth])

@@ -77,6 +77,7 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
     """Draw roll, pitch and yaw (sequence Z-Y-X), and if they are known the gyro bias with its ±3σ and the attitude's σ over time."""
+    estimate = estimate.taken(estimate.known)
     heights = [1.0, 1.0, 1.0, *[1.7] * estimate.has_bias, *[1.3] * estimate.has_covariance]
     size = (9.0, 10.0 * sum(heights) / 6.0)
     figure, axes = style.new_figure(len(heights), 1, size=size, sharex=True, height_ratios=heights)

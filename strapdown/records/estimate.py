@@ -366,6 +366,35 @@ class Estimate(ByValue, Listed):
         )
 
     @property
+    def known(self) -> np.ndarray:
+        """Mask (m,) of the times with an estimate: a filter of another program may give NaN before its first fix or after a failure."""
+        numbers = np.isfinite(np.concatenate([self.attitude, self.bias, self.variance], axis=1))
+        estimated = numbers.any(axis=0)
+        estimated[:4] = True
+        return np.asarray(numbers[:, estimated].all(axis=1))
+
+    def taken(self, rows: Any) -> Estimate:
+        """Return the estimate at some of its times, with all its innovations.
+
+        Parameters
+        ----------
+        rows : slice, ndarray of int or of bool
+            Rows, by index, slice or mask.
+
+        Returns
+        -------
+        Estimate
+            Estimate at these times, with its truth there.
+        """
+        names = ("time", "attitude", "bias", "variance", "covariance", "whole_covariance")
+        parts = {name: value[rows] for name in names if (value := getattr(self, name)) is not None}
+        states = {
+            name: replace(block, values=block.values[rows], variance=block.variance[rows])
+            for name, block in self.error_states.items()
+        }
+        return replace(self, **parts, error_states=states, truth=None if self.truth is None else self.truth.taken(rows))
+
+    @property
     def has_bias(self) -> bool:
         """Whether a gyro bias is estimated."""
         return bool(np.isfinite(self.bias).any())

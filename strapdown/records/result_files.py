@@ -56,9 +56,9 @@ def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
     return attributes
 
 
-def numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
+def numbers(group: Any, name: str, shape: tuple[int | str, ...], *, allow_nan: bool = False) -> Array:
     """Return an array of a file, checked by :func:`strapdown.checks.array`."""
-    return array(reading.place(group, name), reading.numbers(group, name), shape)
+    return array(reading.place(group, name), reading.numbers(group, name), shape, allow_nan=allow_nan)
 
 
 def need_each(place: str, value: Array, good: Any, remedy: str) -> Array:
@@ -70,12 +70,12 @@ def need_each(place: str, value: Array, good: Any, remedy: str) -> Array:
 
 
 def above_zero(place: str, variance: Array) -> Array:
-    """Return variances, checked to be positive."""
+    """Return variances, checked to be positive; NaN is not known."""
     remedy = (
         ", and a variance must be greater than zero; the file is damaged, or a sensor had no noise: give each a sigma above zero and "
         "repeat the estimate"
     )
-    return need_each(place, variance, variance > 0.0, remedy)
+    return need_each(place, variance, ~(variance <= 0.0), remedy)
 
 
 def parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:

@@ -27,17 +27,18 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
     estimate = setup.read_estimate(path)
+    judgement = workflows.check(estimate)
+    estimate = estimate.taken(estimate.known)
     truth = estimate.truth
     error = None
-    if truth is not None:
+    if truth is not None and truth.known.any():
         known = truth.known
         error = np.full((len(estimate.time), 6), np.nan)
         error[known] = consistency.errors(
             estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
         )
     charts = _estimate_charts(estimate) if error is None else _error_charts(estimate, error)
-    judgement = workflows.check(estimate)
-    table = None if truth is None else workflows.accuracy(estimate)
+    table = None if error is None else workflows.accuracy(estimate)
     source = "" if estimate.origin is None else estimate.origin.source
     content = page.page(
         f"Estimate of {source}" if source else f"Estimate {path.name}",
@@ -152,9 +153,8 @@ def _sensor(name: str, innovations: Innovations) -> str:
 
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     """Return a chart of the cumulative distribution of the total attitude error over time; none without a truth."""
-    if truth is None:
+    if truth is None or not (known := truth.known).any():
         return []
-    known = truth.known
     angle = np.sort(quaternion.angle_between(estimate.attitude[known], truth.attitude[known])) / DEGREE
     share = 100.0 * np.arange(1, len(angle) + 1) / len(angle)
     line = page.Series(label="fraction of the time with at most this error", value=share)

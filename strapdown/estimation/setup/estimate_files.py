@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, count, finite, increasing, one_of, unit_quaternions
 from strapdown.estimation.setup.files import from_toml, to_toml
 from strapdown.files import reading, set_attributes
@@ -117,7 +118,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             bias=_biases(file, "bias", rows) if "bias" in file else np.full((rows, 3), np.nan),
             variance=variance,
             covariance=covariance,
-            whole_covariance=numbers(file, "whole_covariance", (rows, "n", "n"))
+            whole_covariance=numbers(file, "whole_covariance", (rows, "n", "n"), allow_nan=True)
             if "whole_covariance" in file
             else None,
             innovations=innovations(file),
@@ -148,29 +149,30 @@ def _variances(file: Any, rows: int) -> tuple[Array, Array | None]:
     without = (0, 6 - size)
     if not ("variance" in file or "covariance" in file):  # of an integrated attitude
         return np.full((rows, 6), np.nan), np.broadcast_to(np.nan, (rows, 6, 6))
-    variance = above_zero(reading.place(file, "variance"), numbers(file, "variance", (rows, size)))
+    variance = above_zero(reading.place(file, "variance"), numbers(file, "variance", (rows, size), allow_nan=True))
     variance = np.pad(variance, ((0, 0), without), constant_values=np.nan)
     if "covariance" not in file:
         return variance, None
-    covariance = numbers(file, "covariance", (rows, size, size))
+    covariance = numbers(file, "covariance", (rows, size, size), allow_nan=True)
     above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
     return variance, np.pad(covariance, ((0, 0), without, without), constant_values=np.nan)
 
 
 def _biases(group: Any, name: str, rows: int) -> Array:
-    """Return gyro biases (rows, 3), checked not to exceed :data:`LARGEST_BIAS`."""
-    value = numbers(group, name, (rows, 3))
+    """Return gyro biases (rows, 3), NaN where not known, checked not to exceed :data:`LARGEST_BIAS`."""
+    value = numbers(group, name, (rows, 3), allow_nan=True)
     remedy = (
         " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
         "the gyro's unit"
     )
-    return need_each(reading.place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
+    return need_each(reading.place(group, name), value, ~(np.abs(value) > LARGEST_BIAS), remedy)
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:
-    """Return attitudes (rows, 4) unchanged, checked to be of unit norm."""
-    value = numbers(group, name, (rows, 4))
-    unit_quaternions(reading.place(group, name), value)
+    """Return attitudes (rows, 4) unchanged, checked to be of unit norm, or NaN where not known."""
+    value = numbers(group, name, (rows, 4), allow_nan=True)
+    unknown = np.isnan(value).all(axis=1, keepdims=True)
+    unit_quaternions(reading.place(group, name), np.where(unknown, quaternion.IDENTITY, value))
     return value
 
 
