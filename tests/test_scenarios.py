@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 from measured import differing
 
+import strapdown as sd
 from strapdown import gyro, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
@@ -207,6 +208,41 @@ def test_jitter_has_the_truth_where_it_sampled_and_losses_are_bridged():
     np.testing.assert_array_equal(lossy.truth.attitude, record.truth.attitude[left])
     steady = scenarios.simulate(dataclasses.replace(base, gyro=GyroSpec(drop_probability=0.2)), 1)
     np.testing.assert_allclose(steady.rates[:, 2], 3.0, rtol=1e-12)
+
+
+def test_saturation_is_counted_and_named_everywhere():
+    """The limit is passed by the motion or by bias and scale factor; a low-pass filter before it lowers the rate."""
+    shaken = load_scenario("two-stars")
+    shaken = dataclasses.replace(
+        shaken, duration=20.0, rate=100.0, motion=motion.Coning(angle=0.05, frequency=1.0), gyro=GyroSpec(range=0.3)
+    )
+    exact = simulate_exactly(shaken)
+    assert 200 < exact < 2000
+    assert shaken.saturation == f"the gyro's saturation at 17.19 °/s in {exact} of 2000 samples"
+    within = dataclasses.replace(shaken, gyro=GyroSpec(range=0.32))
+    biased = dataclasses.replace(shaken, gyro=GyroSpec(range=0.32, turn_on_bias=(0.1, 0.0, 0.0)))
+    assert within.saturation == dataclasses.replace(shaken, gyro=GyroSpec()).saturation == ""
+    assert f"in {simulate_exactly(biased)} of" in biased.saturation
+    smooth = dataclasses.replace(shaken, gyro=GyroSpec(range=0.3, bandwidth=0.2))
+    assert simulate_exactly(smooth) < 0.2 * exact  # at the start only, where the filter has the first rate
+    assert f"in {simulate_exactly(smooth)} of" in smooth.saturation
+
+    noisy = dataclasses.replace(shaken, gyro=GyroSpec(range=0.3, angle_random_walk=1e-4))
+    record = sd.simulate(noisy)
+    assert f"warning: {noisy.saturation}" in record.listing().notes
+    result = sd.estimate(record)
+    assert noisy.saturation in " ".join(result.remarks)
+    assert noisy.saturation in sd.check(result).headline
+    plan = sd.workflows.plan(noisy)
+    assert noisy.saturation in plan.unmodelled
+    assert noisy.saturation in sd.covariance_analysis(noisy, plan.setup, epochs=5).left_out
+
+
+def simulate_exactly(scenario: Scenario) -> int:
+    """Return the number of samples of a scenario without noise that the gyro clips."""
+    free = dataclasses.replace(scenario, gyro=dataclasses.replace(scenario.gyro, range=np.inf))
+    clipped, whole = (sd.simulate(each).increments for each in (scenario, free))
+    return int(np.sum(np.any(clipped != whole, axis=1)))
 
 
 def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():

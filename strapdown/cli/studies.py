@@ -58,7 +58,7 @@ def covariance(
     form: Format = FORMAT,
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
-    from strapdown.estimation import setup
+    from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.workflows.filters import filter_for_scenario, state_words
 
     body, name = sd.scenarios.load_scenario(scenario), Path(scenario).stem
@@ -66,7 +66,7 @@ def covariance(
     named = by_name("--consider", consider or [], "NAME=VALUE, such as scale_factor=300")
     sizes = {name: numbers(f"--consider {name}", text, "a number", 1)[0] for name, text in named.items()}
     errors = sd.covariance.consider.considered(sizes, body.sensors)
-    from_file = None if filter_file is None else setup.read_setup(filter_file)
+    from_file = None if filter_file is None else sd.estimation.setup.read_setup(filter_file)
     filter_setup = filter_for_scenario(body, setup=from_file, states=states)
     with ui.progress_bar("covariance analysis"):
         result = sd.covariance_analysis(body, filter_setup, epochs=epochs, **errors)
@@ -76,7 +76,7 @@ def covariance(
     if not from_file:
         if states is None and filter_setup.states is not None:
             ui.say(state_words(filter_setup.states.names))
-        missing = setup.unmodelled_errors(body.gyro, body.sensors, filter_setup.states, gravity_f=body.gravity_f)
+        missing = unmodelled_errors(sd.records.Origin(gyro=body.gyro, scenario=body), filter_setup)
         ui.say(f"The filter has no state for {', '.join(missing)}." if missing else "")
     write_json(out / "covariance.json", {"scenario": body.name or name, **result.summary()})
     figure = sd.plots.error_budget(result, title=f"{body.name or name}: predicted errors")

@@ -213,6 +213,8 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     timing = ("sampling_jitter", "timestamp_error", "timestamp_offset", "drop_probability")
     names = ("quantization", "rate_resolution", *timing)
     terms = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
+    if scenario.saturation:
+        terms.append(scenario.saturation)
     if spec.temperature is not None:
         terms.append("gyro bias over temperature")
     if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):

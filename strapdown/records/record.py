@@ -174,6 +174,8 @@ class ImuRecord(ByValue, Listed):
         if self.origin is not None and self.origin.scenario is not None:
             name = self.origin.scenario.name or "a scenario"
             notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
+            if self.origin.scenario.saturation:
+                notes.append(f"warning: {self.origin.scenario.saturation}")
         for series in self.vectors:
             sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
             if series.covariance is None and np.any(sigma == 0.0):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from strapdown import vectors
 from strapdown.checks import Array, InputError, array, count, finite, instance, positive
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, simulate
 from strapdown.motion import Motion
 from strapdown.results import ByValue
+from strapdown.units import DEGREE
 from strapdown.vectors import Sensor
 
 MAX_SAMPLES = 1e9
@@ -134,3 +136,16 @@ class Scenario(ByValue):
     def edges(self) -> Array:
         """Nominal edges of the gyro's sample intervals (n + 1,), s, from 0."""
         return np.arange(round(self.duration * self.rate) + 1) / self.rate
+
+    @functools.cached_property
+    def saturation(self) -> str:
+        """Samples in which the rate, without noise, exceeds the gyro's range, in words; empty if there are none."""
+        limit = self.gyro.range
+        if np.isinf(limit):
+            return ""
+        names = ("turn_on_bias", "scale_factor", "asymmetry", "misalignment", "bandwidth", "damping")
+        quiet = GyroSpec(**{name: getattr(self.gyro, name) for name in names})
+        rates = simulate(quiet, self.motion.increments(self.edges), self.edges, np.random.default_rng(0)).rates
+        beyond = np.any(np.abs(rates) > limit, axis=1)
+        words = f"the gyro's saturation at {limit / DEGREE:.4g} °/s in {np.sum(beyond)} of {len(beyond)} samples"
+        return words if beyond.any() else ""

@@ -26,9 +26,11 @@ def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -
     if origin is None or origin.gyro is None or filter_setup is None:
         return ()
     sensors, gravity_f = setup.specified(origin)
-    return setup.unmodelled_errors(
+    missing = setup.unmodelled_errors(
         origin.gyro, sensors, filter_setup.states, gravity_f=gravity_f, rejects=filter_setup.rejects
     )
+    saturation = "" if origin.scenario is None else origin.scenario.saturation
+    return (*missing, saturation) if saturation else missing
 
 
 class Start(NamedTuple):
