@@ -26,6 +26,7 @@ from two_stars import (
     scenario,
 )
 
+import strapdown as sd
 from strapdown import consistency, gyro, motion, quaternion, scenarios, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import setup
@@ -416,6 +417,44 @@ def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():
     # The closed form of two parabolas: a very narrow prior is the answer.
     narrow = {"gyro.arw": tuning.Prior(value=2.0 * ARW, factor=1.0001)}
     assert tuning.fit(objective, priors=narrow, starts=1)["gyro.arw"].value == pytest.approx(2.0 * ARW, rel=1e-3)
+
+
+@pytest.mark.parametrize("factor", [100.0, 0.003])
+def test_a_prior_of_another_gyro_is_named_and_nothing_else_blamed(factor):
+    record = scenarios.simulate(dataclasses.replace(scenarios.load_scenario("two-stars"), duration=120.0), seed=2)
+    own = record.origin.gyro
+    other = gyro.GyroSpec(
+        angle_random_walk=factor * own.angle_random_walk, rate_random_walk=factor * own.rate_random_walk
+    )
+    tuned = sd.tune(record, priors=other, starts=1, threads=1)
+    assert "gyro.arw" in tuned.contradicted
+    arw = tuned["gyro.arw"]
+    assert arw.note == "in doubt: the data contradict its prior"
+    values = f"gyro.arw ({factor * 0.15:.3g} against {arw.value / arw.unit.factor:.3g} °/√h)"
+    answer, reason, _ = tuned.verdict
+    assert answer == "not consistent"
+    assert "the data contradict the prior of" in reason
+    assert values in reason
+    said = " ".join([reason, *tuned.listing().notes, *tuned.words])
+    assert "disturbances" not in said
+    assert "error without a state" not in said
+    assert tuned.summary()["contradicted_priors"] == list(tuned.contradicted)
+    same = sd.tune(record, priors=own, starts=1, threads=1)
+    assert same.contradicted == ()
+    assert same.verdict[0] == "consistent"
+
+
+def test_a_prior_and_data_are_compared_by_the_uncertainty_of_both():
+    """False alarms: 2.7 in 1000 where prior and data are right, whichever of the two is the more precise."""
+    random = np.random.default_rng(1)
+    for spread, error in ((1.0, 0.1), (0.1, 1.0), (0.5, 0.5)):
+        prior = tuning.Prior(value=2.0, factor=math.exp(spread))
+        data = math.log(2.0) + spread * random.standard_normal(100_000) + error * random.standard_normal(100_000)
+        variance = 1.0 / (spread**-2 + error**-2)
+        both = variance * (math.log(2.0) / spread**2 + data / error**2)
+        alarms = np.mean([fitting._contradicts(value, math.sqrt(variance), prior) for value in both])
+        assert alarms == pytest.approx(0.0027, abs=0.0006)
+    assert not fitting._contradicts(math.log(2.0) + 1e-9, prior.spread, prior)
 
 
 def test_priors_from_a_specification_match_its_noise():

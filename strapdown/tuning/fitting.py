@@ -32,6 +32,8 @@ ONE_SIDED = 2.705543454095404
 mass (Self & Liang 1987)."""
 MIN_INFORMATION = 1e-10
 """Minimum information on a log parameter; less is treated as none."""
+CONTRADICTED = 3.0
+"""Difference of prior and data, relative to the σ of both together, above which the data contradict a prior."""
 NEGLIGIBLE = 1e-3
 """Gain of the log likelihood that is negligible."""
 MISFIT = 1.6
@@ -117,7 +119,7 @@ def search(objective: Objective, start: Array, *, fixed: Sequence[int] = (), ste
             # If the information exceeds the curvature, as for innovations that contradict the model, steps are too short.
             bend = 2.0 * (gain - (here.value - there.value))
             factor = np.clip(gain / bend, 0.5, 4.0) if bend > 0.25 * gain else 4.0
-            stretch = float(np.clip(stretch * factor, 1.0, 64.0))
+            stretch = float(np.clip(stretch * factor, 0.25, 64.0))
         x, here, damping = trial, there, max(0.1 * damping, 1e-9)
     return ended(steps, converged=False)
 
@@ -194,6 +196,7 @@ def fit(
         after=best.local.value,
         covariance=errors.covariance,
         misfit=errors.misfit,
+        contradicted=errors.contradicted,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         agreeing=sum(optimum.local.value < best.local.value + NEGLIGIBLE for optimum in optima),
@@ -229,6 +232,8 @@ class _Errors(NamedTuple):
     swollen: Array
     """Ratio of the standard errors to those by the information (p,)."""
     misfit: bool
+    contradicted: tuple[str, ...] = ()
+    """Parameters whose priors the data contradict."""
 
 
 def _errors(objective: Objective, best: Optimum) -> _Errors:
@@ -245,7 +250,24 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
     swollen = np.ones(len(best.point))
     if misfit or objective.composite:
         swollen = np.maximum(sandwich / standard, 0.0 if objective.composite else 1.0)
-    return _Errors(covariance * np.outer(swollen, swollen), swollen * standard, swollen, misfit)
+    contradicted = tuple(
+        name
+        for name, prior in objective.priors.items()
+        if _contradicts(best.point[j := objective.names.index(name)], float(standard[j]), prior)
+    )
+    return _Errors(covariance * np.outer(swollen, swollen), swollen * standard, swollen, misfit, contradicted)
+
+
+def _contradicts(log_value: float, standard: float, prior: Prior) -> bool:
+    """Return whether the data contradict a prior, given the most likely value by both and its standard error.
+
+    With d the difference of the two and their variances s² and p², the most likely value is d p²/(p² + s²) from the prior, and its variance
+    v = p² s²/(p² + s²); so its distance over √(p² − v) is d/√(p² + s²), which is normal if both are right.
+    """
+    left = prior.spread**2 - standard**2
+    away = abs(log_value - float(np.log(prior.value)))
+    # Without information the prior is the answer, to rounding.
+    return left > 1e-6 * prior.spread**2 and away > CONTRADICTED * float(np.sqrt(left))
 
 
 def covariances(information: Array, parts: Array) -> tuple[Array, Array]:
@@ -361,6 +383,8 @@ def _note(objective: Objective, best: Optimum, j: int, interval: _Interval, erro
     """Return the interpretation of parameter j."""
     name = objective.names[j]
     prior = objective.priors.get(name)
+    if name in errors.contradicted:
+        return "in doubt: the data contradict its prior"
     if prior is not None and best.local.information[j, j] < 2.0 * prior.spread**-2:
         return "from the prior; this record adds little"
     if not interval.identified:

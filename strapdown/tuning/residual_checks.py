@@ -156,14 +156,15 @@ MAX_EXAMINED = 4
 def examined(cases: Sequence[Case], tuning: Tuning) -> Tuning:
     """Return a tuning with tests of each record for errors that the filter does not model; without if its states model them already.
 
-    The random walk of the bias has a note if a scale factor explains the innovations better.
+    Nor if the data contradict a prior, which is the likely cause then. The random walk of the bias has a note if a scale factor explains
+    the innovations better.
     """
     by_axis = any(  # the search for causes supports one σ per sample only
         series.anisotropic or (series.kind != "attitude" and isinstance(tuning.setup.sigma.get(series.sensor), tuple))
         for case in cases
         for series in case.record.vectors
     )
-    if tuning.setup.states is not None or by_axis:
+    if tuning.setup.states is not None or by_axis or tuning.contradicted:
         return tuning
     tested = tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
     parameters = list(tuning.parameters)

@@ -89,6 +89,8 @@ class Tuning(Listed):
         Number of searches that ended within 0.001 of the best log likelihood.
     objective : Objective
         Function that was minimised, for :func:`slices` of it.
+    contradicted : tuple of str, default empty
+        Parameters whose priors the data contradict, by more than three σ of both together.
     gate : TunedGate, optional
         The gate, if outliers were modelled.
     comparison : Comparison, optional
@@ -110,6 +112,7 @@ class Tuning(Listed):
     misfit: bool
     agreeing: int
     objective: Objective
+    contradicted: tuple[str, ...] = ()
     gate: TunedGate | None = None
     comparison: Comparison | None = None
     unmodelled: tuple[Unmodelled, ...] = ()
@@ -140,6 +143,7 @@ class Tuning(Listed):
             "objective": {"name": measure, "before": self.before, "after": self.after},
             "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
             "innovations_fit": not self.misfit,
+            "contradicted_priors": self.contradicted,
             "unmodelled": [check.summary() for check in self.unmodelled],
         }
         if self.gate is not None:
@@ -179,7 +183,9 @@ class Tuning(Listed):
                 "For a parameter that is not identified these records give only an upper bound; the filter uses the value in the column "
                 f"“after”, the mean below that bound. A prior can be given by {Hint('priors')}."
             )
-        if self.misfit:
+        if self.contradicted:
+            notes.append(f"{self._prior_words[0].upper()}{self._prior_words[1:]}.")
+        elif self.misfit:
             remedy = (
                 "A common scale leaves the estimates unchanged; it makes σ correct on average, not at each time."
                 if self.parameters[0].name == SCALE
@@ -201,6 +207,16 @@ class Tuning(Listed):
         )
         return Table("Tuned parameters with 95 % intervals", columns, rows, notes, left=2, name="parameters")
 
+    @property
+    def _prior_words(self) -> str:
+        """The priors that the data contradict, with both values and the remedy."""
+        pairs = []
+        for parameter in map(self.__getitem__, self.contradicted):
+            unit, prior = parameter.unit, self.objective.priors[parameter.name].value
+            values = (figure(value / unit.factor, 3) for value in (prior, parameter.value))
+            pairs.append(f"{parameter.name} ({' against '.join(values)} {unit.name})")
+        return f"the data contradict the prior of {' and '.join(pairs)}: give the noise of this gyro as {Hint('priors')}, or leave it out"
+
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter with this name."""
         known_keys("tuning", [name], [parameter.name for parameter in self.parameters])
@@ -213,6 +229,8 @@ class Tuning(Listed):
         if comparison is None:
             prove = f"{Hint('holdout')} validates a tuning on held-out data"
             details = [words for check in self.unmodelled for words in check.words]
+            if self.contradicted:
+                return "not consistent", f"{self._prior_words}; {prove}", []
             if self.misfit or details:
                 return (
                     "not consistent",
@@ -226,6 +244,7 @@ class Tuning(Listed):
         order = lambda judged: (VERDICTS.index(judged.verdict), sum(finding.rejected for finding in judged.findings))  # noqa: E731
         worst = max(judgements, key=order)
         details = [finding.means for finding in worst.findings if finding.rejected]
+        details += [self._prior_words] if self.contradicted else []
         if not comparison.better and not self.composite:
             details.append("on the held-out data the likelihood has decreased: keep the previous filter")
         elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
