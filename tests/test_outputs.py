@@ -151,6 +151,33 @@ def test_a_table_says_all_in_its_names(case):
     np.testing.assert_array_equal(ned["heading_deg"], table["heading_deg"])
 
 
+def test_a_file_alone_says_what_sigma_and_axes_are(case, tmp_path):
+    """Filtered or smoothed, upper bounds or not, the axes: without them a table of a recording cannot be judged or used."""
+    estimate, _ = case
+    for smoothed, motion, words in (
+        (False, "", "East-North-Up, magnetic North"),
+        (True, "hand", "z up, heading arbitrary (no magnetometer)"),
+    ):
+        told = replace(estimate, smoothed=smoothed, motion=motion, fixed_frame=words)
+        table = told.table()
+        *_, smooth_column, bound_column, frame_column = table
+        assert (smooth_column, bound_column) == ("smoothed", "sigma_upper_bound")
+        assert set(table["smoothed"]) == {smoothed}
+        assert set(table["sigma_upper_bound"]) == {bool(motion)}
+        names = {"East": "east_north_up_magnetic_north", "z up": "z_up_heading_arbitrary"}
+        assert frame_column == f"fixed_frame_{names[words[:4]]}"
+        names = {"East": "north_east_down_magnetic_north", "z up": "z_down_heading_arbitrary"}
+        assert list(told.table(frame="NED"))[-1] == f"fixed_frame_{names[words[:4]]}"
+        recordings.write(told, tmp_path / "told.csv")
+        assert bool(sd.read_attitudes(tmp_path / "told.csv").motion) is bool(motion)
+        recordings.write(told, tmp_path / "told.tum", frame="NED")
+        head = (tmp_path / "told.tum").read_text().splitlines()[0]
+        assert ("down" in head.lower(), "smoothed" in head) == (True, smoothed)
+        assert len(sd.read_attitudes(tmp_path / "told.tum").attitude) == len(told.time)
+    assert list(replace(estimate, fixed_frame="").table())[-1] == "sigma_upper_bound"
+    assert list(replace(estimate, fixed_frame="").table(frame="NED"))[-1] == "fixed_frame_north_east_down"
+
+
 @pytest.mark.parametrize("ending", ["csv", "tsv", "parquet"])
 def test_tables_in_files_hold_the_same_numbers(case, tmp_path, ending):
     estimate, _ = case

@@ -56,7 +56,7 @@ class Attitudes:
         Whether the unit moved, if the file states it.
     motion : str, default ""
         Model of the motion, if the attitudes are an estimate of this package for a recording: its σ are then upper bounds
-        (:class:`strapdown.records.Estimate`).
+        (:class:`strapdown.records.Estimate`); a table states only that they are.
     remarks : tuple of str, default empty
         Choices of the reader.
     """
@@ -215,6 +215,7 @@ COLUMNS: dict[str, str] = {
     "sigma": r"(sigma|std)_(?P<axis>[xyz])_(?P<unit>rad|deg)",
     "angle": r"(?P<axis>roll|pitch|yaw)_(sigma|std)_(?P<unit>rad|deg)",
     "bias": r"(gyro_)?bias_(?P<axis>[xyz])_(?P<unit>rad_per_s|deg_per_h|deg_per_s)",
+    "bound": r"sigma_upper_bound",
 }
 """Columns of a table by their content: patterns of whole names, in lower case. ``cov_xy_rad2`` is an element of the covariance of the
 attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one with its axes named; ``sigma_x_deg`` and
@@ -258,6 +259,7 @@ def _table(path: Path) -> Attitudes:
         covariance=covariance,
         error_frame=angles or frame,
         bias=bias,
+        motion="not stated" if any(np.any(column) for column in columns["bound"].values()) else "",
         remarks=tuple(remarks),
     )
 

@@ -131,6 +131,7 @@ def write_tum(estimate: Estimate, path: Path, *, frame: str = "ENU") -> None:
     q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
     stamps = whole_ns(estimate.time) + estimate.epoch_ns
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        file.write("# time tx ty tz qx qy qz qw\n")
+        context = [estimate.frame_words(frame), "smoothed" if estimate.smoothed else ""]
+        file.write("; ".join(["# time tx ty tz qx qy qz qw", *filter(None, context)]) + "\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
             file.write(f"{Decimal(stamp).scaleb(-9):f} 0 0 0 {' '.join(map(repr, row))}\n")

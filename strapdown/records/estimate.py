@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -463,7 +464,9 @@ class Estimate(ByValue, Listed):
         dict of str to ndarray (m,)
             ``time_s`` (or ``time_ns`` for a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
             ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h. If full covariances were stored,
-            ``cov_body_xx_rad2`` … of the body-side error, with ``b`` before an axis for the bias.
+            ``cov_body_xx_rad2`` … of the body-side error, with ``b`` before an axis for the bias. At the end, the same in each row:
+            ``smoothed`` and ``sigma_upper_bound``, 1 or 0, and a column of ones whose name has the fixed frame, such as
+            ``fixed_frame_east_north_up_magnetic_north``.
         """
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance
@@ -492,7 +495,28 @@ class Estimate(ByValue, Listed):
             for i, j in itertools.combinations_with_replacement(range(size), 2):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
                 columns[f"cov_body_{STATES[i]}{STATES[j]}_{unit}"] = self.covariance[:, i, j]
-        return columns
+        context = {"smoothed": self.smoothed, "sigma_upper_bound": bool(self.motion)} if self.has_covariance else {}
+        if words := self.frame_words(frame):
+            context[f"fixed_frame_{re.sub('[^a-z]+', '_', words.partition(' (')[0].lower())}"] = True
+        return columns | {name: np.full(len(q), value, np.int8) for name, value in context.items()}
+
+    def frame_words(self, frame: str) -> str:
+        """Return the fixed frame of exported attitudes in words, empty if it is that of the record's references.
+
+        Parameters
+        ----------
+        frame : {"ENU", "NED"}
+            Fixed frame of :meth:`table`.
+
+        Returns
+        -------
+        str
+            Its axes and its North.
+        """
+        if frame == "ENU":
+            return self.fixed_frame
+        down = self.fixed_frame.replace("East-North-Up", "North-East-Down").replace("z up", "z down")
+        return down or "North-East-Down"
 
     def to_dataframe(self, **options: Any) -> Any:
         """Return the estimate as a pandas ``DataFrame`` with the columns of :meth:`table`.
