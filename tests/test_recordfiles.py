@@ -137,6 +137,16 @@ def test_missing_samples_of_every_kind_go_through_a_file(simulated, tmp_path):
     assert not differing(read_record(tmp_path / "record.h5"), record)
 
 
+def test_the_movement_of_a_truth_goes_through_a_file(simulated, tmp_path):
+    record = simulated[1]
+    moving = np.arange(len(record.time)) % 3 > 0
+    record = dataclasses.replace(record, truth=dataclasses.replace(record.truth, movement=moving))
+    write_record(tmp_path / "record.h5", record)
+    assert read_record(tmp_path / "record.h5") == record
+    with pytest.raises(InputError, match=r"truth.movement has shape .*; give it at each edge"):
+        dataclasses.replace(record, truth=dataclasses.replace(record.truth, movement=moving[1:]))
+
+
 @pytest.mark.parametrize(
     ("where", "name", "value", "words"),
     [

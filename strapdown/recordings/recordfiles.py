@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from strapdown import gyro
 from strapdown.checks import Array, InputError, count
 from strapdown.files import reading, set_attributes
@@ -62,6 +64,8 @@ def write_record(path: str | os.PathLike[str], record: ImuRecord) -> None:
         if record.truth is not None:
             put(file, "truth/attitude", record.truth.attitude, "1", "q_fb at the edges")
             put(file, "truth/bias", record.truth.bias, "rad/s", "gyro bias at the edges, body axes")
+            if record.truth.movement is not None:
+                put(file, "truth/movement", record.truth.movement.astype(np.float64), "1", "1: the unit moves")
         if record.temperature is not None:
             put(file, "temperature", record.temperature, "degC", "of the gyro, at the edges")
 
@@ -91,7 +95,9 @@ def read_record(path: str | os.PathLike[str]) -> ImuRecord:
         series = tuple(_series(group[str(number)]) for number in range(len(group)))
         truth = None
         if "truth" in file:
-            truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
+            movement = _values(file, "truth/movement", "1") > 0.0 if "truth/movement" in file else None
+            attitude, bias = _values(file, "truth/attitude", "1"), _values(file, "truth/bias", "rad/s")
+            truth = Truth(attitude=attitude, bias=bias, movement=movement)
         return ImuRecord(
             time=_values(file, "time", "s"),
             increments=_values(file, "increments", "rad"),

@@ -158,6 +158,11 @@ class ImuRecord(ByValue, Listed):
             raise InputError(f"vectors has two series of the same name among {names}; give each sensor its own name")
         if self.truth is not None:
             attitude = array("truth.attitude", self.truth.attitude, (len(time), 4))
+            moving = self.truth.movement
+            if moving is not None and np.shape(moving) != time.shape:
+                raise InputError(
+                    f"truth.movement has shape {np.shape(moving)}, wanted {time.shape}; give it at each edge"
+                )
             truth = dataclasses.replace(
                 self.truth,
                 attitude=unit_quaternions("truth.attitude", attitude),
