@@ -140,6 +140,7 @@ def test_rows_without_an_estimate_by_every_way(tmp_path):
     whole = sd.check(result.taken(late)).summary()
     assert summary["findings"] == whole["findings"]
     assert f"no estimate at 100 of {m} times, which are not judged" in summary["limits"]
+    assert len(sd.read_attitudes(file).attitude) == m - 100
     assert sd.accuracy(result).summary() == sd.accuracy(result.taken(late)).summary()
     assert sd.plots.estimate_overview(result)
     assert sd.read(sd.write(replace(result, truth=None), tmp_path / "alone.h5")) == replace(result, truth=None)

@@ -172,14 +172,18 @@ def _own(path: Path, kind: str) -> Attitudes:
             bias = reading.numbers(file, "bias") if "bias" in file else None
             innovations = result_files.innovations(file)
             attributes = reading.attributes(file)
+        known = np.isfinite(arrays["attitude"]).all(axis=1)
+        if not known.any():
+            raise InputError(f"{path} is an estimate without a single attitude, because its filter failed; repeat it")
+        time = arrays["time"][known]
         return Attitudes(
             source=path.name,
-            stamps_ns=whole_ns(arrays["time"]) + recordfiles.epoch_of(attributes),
-            attitude=quaternion.normalize(arrays["attitude"]),
-            covariance=P,
+            stamps_ns=whole_ns(time) + recordfiles.epoch_of(attributes),
+            attitude=quaternion.normalize(arrays["attitude"][known]),
+            covariance=None if P is None else P[known],
             error_frame="" if P is None else "body",
-            bias=bias,
-            innovations={k: replace(series, time=series.time - arrays["time"][0]) for k, series in innovations.items()},
+            bias=None if bias is None else bias[known],
+            innovations={k: replace(series, time=series.time - time[0]) for k, series in innovations.items()},
             motion=str(attributes.get("motion", "")),
         )
     if kind == recordfiles.KIND:
