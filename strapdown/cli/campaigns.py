@@ -25,7 +25,7 @@ class _Model:
     """Filter and errors; a campaign file contains its own."""
 
     filter_file: Path | None = Option(
-        None, "--filter", help="TOML with a filter table; or FILE.py:NAME, your own, executed."
+        None, "--filter", help="TOML with a filter table, and its gate; or FILE.py:NAME, your own, executed."
     )
     gyro: Path | None = GYRO
     dispersions: Path | None = Option(None, help="TOML with a table named dispersions: what differs from run to run.")

@@ -14,7 +14,7 @@ from strapdown.checks import InputError
 Format = Literal["png", "pdf", "svg"]
 """Formats of figures."""
 FORMAT: Any = Option("png", "--format", help="Format of the figures.")
-FILTER: Any = Option(None, "--filter", help="TOML with a table named filter. Default: a matched one.")
+FILTER: Any = Option(None, "--filter", help="TOML with a table named filter, and its gate. Default: a matched one.")
 STATES: Any = Option(None, "--states/--no-states", help="States for the specified errors, or none. Default: if needed.")
 GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
 SCENARIO = "Name of a built-in scenario, or a TOML file."
