@@ -184,6 +184,34 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
     assert "flicker" not in words
 
 
+def test_a_gyro_with_unequal_axes_makes_its_filter_pessimistic_and_that_is_said():
+    """The covariance analysis has the errors of each axis: those about the quieter ones are below the filter's σ, by less than stated."""
+    scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=100.0)
+    arw = float(np.max(scenario.gyro.angle_random_walk))
+    unequal = dataclasses.replace(scenario.gyro, angle_random_walk=(0.25 * arw, 0.25 * arw, arw))
+    other = dataclasses.replace(scenario, gyro=unequal, gyro_preset="")
+    plan = sd.workflows.plan(other)
+    (words,) = plan.limits
+    assert "(angle random walk ×4)" in words
+    analysis = sd.covariance_analysis(other, plan.setup, epochs=5)
+    ratio = np.sqrt(np.diagonal(analysis.filter_covariance[-1])) / analysis.rms[-1]
+    assert np.all(ratio[[0, 1]] > 1.1)
+    assert np.all(ratio[[0, 1]] < 4.0)
+    assert ratio[2] == pytest.approx(1.0, abs=0.01)
+    result = sd.estimate(sd.simulate(other))
+    assert words in sd.check(result).limits
+    assert f"{words[0].upper()}{words[1:]}." in result.remarks
+    assert words in sd.monte_carlo(other, runs=8).judge().limits
+
+    assert sd.workflows.plan(scenario).limits == ()
+    quieter = dataclasses.replace(
+        plan.setup, process_noise=sd.ProcessNoise(angle_random_walk=0.5 * arw, rate_random_walk=0.0)
+    )
+    assert sd.workflows.plan(other, setup=quieter).limits == ()
+    none = dataclasses.replace(unequal, bias_instability=(0.0, 0.0, 1e-6))
+    assert "bias instability ×∞" in sd.workflows.plan(dataclasses.replace(other, gyro=none)).limits[0]
+
+
 @pytest.mark.parametrize("name", ["mine.py:textbook", "folder.x/mine.py"])
 def test_a_python_file_is_no_setup(name):
     with pytest.raises(InputError, match=f"{name} is a filter of your own, .* give a TOML file"):

@@ -25,7 +25,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
-from strapdown.estimation.setup.for_record import unmodelled_errors
+from strapdown.estimation.setup.for_record import unequal_axes, unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import ByValue, Column, Listed, Table, figure
@@ -315,6 +315,7 @@ def judge(
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         limits.append(f"the σ of {listed(tuple(estimate.error_states))} is not tested: {NO_TRUTH}")
+    limits += unequal_axes(estimate.origin, estimate.setup)
     judged = concluded(
         _one_sided(findings) if estimate.motion else findings,
         limits,

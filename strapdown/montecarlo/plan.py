@@ -191,8 +191,16 @@ class Plan(ByValue):
     @property
     def unmodelled(self) -> tuple[str, ...]:
         """Errors, in words, that the scenario specifies and the filter has no state for."""
-        origin = Origin(gyro=self.scenario.gyro, scenario=self.scenario)
-        return setup.for_record.unmodelled_errors(origin, self.setup)
+        return setup.for_record.unmodelled_errors(self._origin, self.setup)
+
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """What the filter's σ do not represent, in words, and is no error without a state."""
+        return setup.for_record.unequal_axes(self._origin, self.setup)
+
+    @property
+    def _origin(self) -> Origin:
+        return Origin(gyro=self.scenario.gyro, scenario=self.scenario)
 
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of strings and numbers, for comparison and for :func:`from_table`.
