@@ -298,7 +298,10 @@ def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
     verdicts = [SimpleNamespace(verdict=verdict, reason="r", findings=findings) for verdict, findings in pairs]
     after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
     comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
-    tuned, verdict = SimpleNamespace(comparison=comparison, composite=False), sd.tuning.Tuning.verdict.fget
+    tuned, verdict = (
+        SimpleNamespace(comparison=comparison, composite=False, contradicted=()),
+        sd.tuning.Tuning.verdict.fget,
+    )
     answer, reason, details = verdict(tuned)
     assert (answer, reason) == ("not consistent", "r, on the held-out data of the worst record")
     assert details == ["even", "odd", "on the held-out data the likelihood has decreased: keep the previous filter"]

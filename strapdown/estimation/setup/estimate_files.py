@@ -111,14 +111,15 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         time = increasing(reading.place(file, "time"), numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
-        variance, covariance = _variances(file, rows)
+        known = np.asarray(np.isfinite(attitude).all(axis=1))
+        variance, covariance = _variances(file, known)
         return Estimate(
             time=time,
             attitude=attitude,
-            bias=_biases(file, "bias", rows) if "bias" in file else np.full((rows, 3), np.nan),
+            bias=_biases(file, "bias", known) if "bias" in file else np.full((rows, 3), np.nan),
             variance=variance,
             covariance=covariance,
-            whole_covariance=numbers(file, "whole_covariance", (rows, "n", "n"), allow_nan=True)
+            whole_covariance=_at_known(file, "whole_covariance", (rows, "n", "n"), known)
             if "whole_covariance" in file
             else None,
             innovations=innovations(file),
@@ -143,24 +144,32 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         )
 
 
-def _variances(file: Any, rows: int) -> tuple[Array, Array | None]:
+def _at_known(group: Any, name: str, shape: tuple[int | str, ...], known: np.ndarray) -> Array:
+    """Return an array of a file that is finite at the rows that are known."""
+    value = numbers(group, name, shape, allow_nan=True)
+    unknown = ~known.reshape(-1, *[1] * (value.ndim - 1))
+    remedy = ", although the row has an attitude; the file is damaged, repeat the estimate"
+    return need_each(reading.place(group, name), value, np.isfinite(value) | unknown, remedy)
+
+
+def _variances(file: Any, known: np.ndarray) -> tuple[Array, Array | None]:
     """Return variance (rows, 6) and covariance (rows, 6, 6) of attitude and bias, NaN where there is none, without a covariance None."""
-    size = 6 if "bias" in file else 3  # an estimate of another program may have none
+    rows, size = len(known), 6 if "bias" in file else 3  # an estimate of another program may have none
     without = (0, 6 - size)
     if not ("variance" in file or "covariance" in file):  # of an integrated attitude
         return np.full((rows, 6), np.nan), np.broadcast_to(np.nan, (rows, 6, 6))
-    variance = above_zero(reading.place(file, "variance"), numbers(file, "variance", (rows, size), allow_nan=True))
+    variance = above_zero(reading.place(file, "variance"), _at_known(file, "variance", (rows, size), known))
     variance = np.pad(variance, ((0, 0), without), constant_values=np.nan)
     if "covariance" not in file:
         return variance, None
-    covariance = numbers(file, "covariance", (rows, size, size), allow_nan=True)
+    covariance = _at_known(file, "covariance", (rows, size, size), known)
     above_zero(f"{reading.place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
     return variance, np.pad(covariance, ((0, 0), without, without), constant_values=np.nan)
 
 
-def _biases(group: Any, name: str, rows: int) -> Array:
-    """Return gyro biases (rows, 3), NaN where not known, checked not to exceed :data:`LARGEST_BIAS`."""
-    value = numbers(group, name, (rows, 3), allow_nan=True)
+def _biases(group: Any, name: str, known: np.ndarray) -> Array:
+    """Return gyro biases (rows, 3), finite at the rows that are known, checked not to exceed :data:`LARGEST_BIAS`."""
+    value = _at_known(group, name, (len(known), 3), known)
     remedy = (
         " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
         "the gyro's unit"
@@ -186,7 +195,7 @@ def _truth(file: Any, rows: int) -> Truth:
             raise InputError(f"{place} are not increasing rows of the estimate; the file is damaged")
     attitude = np.full((rows, 4), np.nan)
     attitude[row] = _attitudes(file, "truth/attitude", len(row))
-    bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
+    bias = _biases(file, "truth/bias", np.zeros(rows, bool)) if "truth/bias" in file else np.full((rows, 3), np.nan)
     movement = numbers(file, "truth/movement", (rows,)) > 0.0 if "truth/movement" in file else None
     return Truth(attitude=attitude, bias=bias, movement=movement)
 
