@@ -212,6 +212,20 @@ def test_a_gyro_with_unequal_axes_makes_its_filter_pessimistic_and_that_is_said(
     assert "bias instability ×∞" in sd.workflows.plan(dataclasses.replace(other, gyro=none)).limits[0]
 
 
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        ({"rate_ramp": 20.0 * units.DEGREE_PER_HOUR / 3600.0}, "the gyro's rate ramp of 20 °/h²"),
+        ({"bandwidth": 40.0}, "the lag of the gyro's bandwidth of 40 Hz"),
+        ({"timestamp_offset": -0.05}, "the gyro's time stamps, late by -0.05 s"),
+        ({"timestamp_error": 0.002}, "the gyro's irregular sampling or time stamps"),
+        ({"sampling_jitter": 0.002}, "the gyro's irregular sampling or time stamps"),
+    ],
+)
+def test_errors_of_the_gyro_that_no_state_covers_are_named(error, words):
+    assert setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, **error)) == (words,)
+
+
 @pytest.mark.parametrize("name", ["mine.py:textbook", "folder.x/mine.py"])
 def test_a_python_file_is_no_setup(name):
     with pytest.raises(InputError, match=f"{name} is a filter of your own, .* give a TOML file"):

@@ -223,9 +223,9 @@ def _specified_errors(
     spec: GyroSpec, sensors: Sequence[Any], gravity_f: Sequence[float], rejects: bool
 ) -> list[tuple[str, str]]:
     """Return the name of the state, empty if there is none, and the words for each specified error."""
-    scale, asymmetry, misalignment, flicker = (
+    scale, asymmetry, misalignment, flicker, ramp = (
         float(np.max(np.abs(getattr(spec, name))))
-        for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability")
+        for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability", "rate_ramp")
     )
     terms: list[tuple[Any, str, str]] = [
         (scale, "gyro.scale", f"the gyro's scale factor of {scale / 1e-6:.3g} ppm"),
@@ -239,6 +239,10 @@ def _specified_errors(
         (np.any(gravity_f) * spec.g_sensitivity, "gyro.force", "the gyro's sensitivity to acceleration"),
         (spec.temperature is not None, "gyro.temperature", "the gyro's bias over temperature"),
         (np.max(spec.quantization) + np.max(spec.rate_resolution), "", "the gyro's quantisation"),
+        (ramp, "", f"the gyro's rate ramp of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²"),
+        (np.isfinite(spec.bandwidth), "", f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz"),
+        (spec.timestamp_offset, "", f"the gyro's time stamps, late by {spec.timestamp_offset:.3g} s"),
+        (spec.timestamp_error + spec.sampling_jitter, "", "the gyro's irregular sampling or time stamps"),
     ]
     for sensor in sensors:
         name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
