@@ -60,7 +60,11 @@ sigma_about_arcsec = 60.0
 def test_the_simulated_bias_is_the_polynomial_of_the_course(tmp_path):
     scenario = scenarios.scenario_from_toml(TOML)
     assert scenarios.scenario_from_toml(scenarios.scenario_to_toml(scenario)) == scenario
-    assert from_table(to_table(scenario.gyro.temperature)) == scenario.gyro.temperature
+    table = to_table(scenario.gyro.temperature)
+    assert from_table(table) == scenario.gyro.temperature
+    constant = {key: value for key, value in table.items() if "_per_k" not in key}
+    with pytest.raises(InputError, match=r"known: .*bias_rad_per_s_per_k, sigma_rad_per_s_per_k"):
+        from_table({**constant, "slope_deg_per_hour_per_k": [0.0] * 3})
     quiet = replace(scenario.gyro, angle_random_walk=0.0, rate_random_walk=0.0)
     record = scenarios.simulate(replace(scenario, gyro=quiet))
     T = 40.0 - 20.0 * np.exp(-record.time / 100.0)

@@ -54,6 +54,8 @@ def _least(section):
             scenario["motion"] = {"type": "harmonic-rates", "harmonics": [table]}
         case "[gyro]" | "[temperature]":
             scenario[section.header.strip("[]")] = table
+        case "[gyro.temperature]":
+            scenario["gyro"], scenario["temperature"] = {"temperature": table}, {"start_degc": 20.0, "end_degc": 30.0}
         case "[[sensors]]":
             if section.type == "horizon":
                 table["orbit"] = _required(SECTIONS[NAMES.index("[sensors.orbit]")])

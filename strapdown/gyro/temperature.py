@@ -83,7 +83,7 @@ def from_table(table: Any, place: str = "temperature") -> BiasOverTemperature:
     keys = [key for key in _keys(STEM, len(table)) if key == STEM or f"bias_{key}" in table]
     limits = ("reference_degc", "lowest_degc", "highest_degc")
     needed = [*limits, *(f"bias_{key}" for key in keys), *(f"sigma_{key}" for key in keys[1:])]
-    known_keys(place, table, needed)
+    known_keys(place, table, dict.fromkeys([*needed, *(f"{term}_{STEM}_per_k" for term in ("bias", "sigma"))]))
     missing = [key for key in needed if key not in table]
     if missing:
         raise InputError(f"{place} lacks {', '.join(missing)}; `strapdown allan` writes a complete table")

@@ -78,7 +78,7 @@ def sections() -> list[Section]:
         for word, (kind, form, faults) in toml.SENSORS.items()
     ]
     path = _section("sensors", "[sensors.orbit]", orbit.CircularOrbit, _keys(orbit.CircularOrbit, toml.ORBIT))
-    return [top, *_motions(), _gyro(), warm, *sensors, path]
+    return [top, *_motions(), _gyro(), _warm_gyro(), warm, *sensors, path]
 
 
 def named(name: str) -> list[Section]:
@@ -160,11 +160,32 @@ def _gyro() -> Section:
     example = next(iter(datasheets.PRESETS))
     preset = Key(name="preset", type="text", default="none", meaning=meaning, example=example)
     own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
-    summary = (
-        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan` "
-        "writes it to `gyro-temperature.toml`."
+    return Section(group="gyro", header="[gyro]", summary="the gyro; what is left out is perfect.", keys=(preset, *own))
+
+
+def _warm_gyro() -> Section:
+    """Return the table of the bias over temperature, to first order."""
+    reference, span, each = (
+        "Temperature T₀ of the polynomial",
+        "temperature of the fit, beyond which the bias is constant",
+        [0.0] * 3,
     )
-    return Section(group="gyro", header="[gyro]", summary=summary, keys=(preset, *own))
+    keys = (
+        *(("reference_degc", "°C", "number", reference, 25.0), ("lowest_degc", "°C", "number", f"Lowest {span}", 0.0)),
+        ("highest_degc", "°C", "number", f"Highest {span}", 50.0),
+        ("bias_rad_per_s", "rad/s", "list of 3", "Bias c₀ at T₀, body axes", each),
+        ("bias_rad_per_s_per_k", "rad/s/K", "list of 3", "Slope c₁; for a higher order also …_per_k2, and so on", each),
+        ("sigma_rad_per_s_per_k", "rad/s/K", "list of 3", "Standard deviation of the slope, drawn in every run", each),
+    )
+    return Section(
+        group="gyro",
+        header="[gyro.temperature]",
+        summary="Bias of the gyro over temperature, Σ c_k (T − T₀)^k, as `strapdown allan` writes it to `gyro-temperature.toml`.",
+        keys=tuple(
+            Key(name=name, unit=unit, type=kind, default="required", meaning=f"{meaning}.", example=example)
+            for name, unit, kind, meaning, example in keys
+        ),
+    )
 
 
 # ------------------------------------------------------------------------------------------------------- from the dataclasses
