@@ -705,11 +705,15 @@ def test_only_an_error_that_is_drawn_in_every_run_is_said_to_average_out():
     scenario, belief = with_states()
     analysis = covariance.analyse(scenario, belief, epochs=2)
     large = 3.0 * analysis.filter_sigma[:, None, :]
-    fixed = dataclasses.replace(analysis, fixed=("scale",), fixed_errors=large)
+    fixed = dataclasses.replace(analysis, fixed=("scale",), fixed_errors=large, drawn=("scale",))
     assert fixed.words.startswith("For a unit with exactly the specified constant errors, the filter is optimistic")
     considered = dataclasses.replace(fixed, considered=("mounting",), considered_errors=large)
-    for other in (considered, dataclasses.replace(fixed, units_drawn=False)):
+    for other in (considered, dataclasses.replace(fixed, drawn=())):
         assert other.words.startswith("The filter will be optimistic in ")
+    slow = dataclasses.replace(scenario, gyro=dataclasses.replace(scenario.gyro, bandwidth=20.0))
+    analysis = covariance.analyse(slow, belief, epochs=2)
+    assert set(analysis.fixed) - set(analysis.drawn) == {"gyro bandwidth"}
+    assert analysis.drawn == ("compass (fixed)",)
 
 
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):

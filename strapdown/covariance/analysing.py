@@ -114,7 +114,9 @@ def analyse(
             for sensor, (total, degrees) in zip(scenario.sensors, out.nis, strict=True)
             if degrees > 0.0
         },
-        units_drawn=setup.states is not None and setup.states.has_constants,
+        drawn=tuple(fixed[k].name for k in real if fixed[k].drawn)
+        if setup.states is not None and setup.states.has_constants
+        else (),
         left_out=_left_out(scenario, setup),
         beyond_linear=(),
     )

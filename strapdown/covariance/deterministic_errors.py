@@ -50,6 +50,11 @@ class DeterministicError:
     sensor: int = -1
     """Sensor whose own errors the column is."""
 
+    @property
+    def drawn(self) -> bool:
+        """Whether a Monte Carlo of a filter with states for them draws the errors in each run (:func:`strapdown.scenarios.drawn`)."""
+        return self.sensor >= 0 or self.name in ("gyro scale factor", "gyro misalignment", "gyro g-sensitivity")
+
 
 def fixed_errors(scenario: Scenario, setup: FilterSetup, path: Trajectory) -> list[DeterministicError]:
     """Return the errors that are the same in every run."""

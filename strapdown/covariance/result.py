@@ -43,8 +43,8 @@ class Analysis(Listed):
         Error due to one standard deviation of each of them, rad and rad/s.
     expected_nis : mapping of str to float
         Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter.
-    units_drawn : bool
-        Whether a Monte Carlo draws the constant errors in each run, because the filter has states for them.
+    drawn : tuple of str
+        Those of the fixed errors that a Monte Carlo draws in each run, because the filter has states for them.
     left_out : tuple of str
         Errors of the scenario that the analysis does not include.
     beyond_linear : tuple of str
@@ -62,7 +62,7 @@ class Analysis(Listed):
     considered: tuple[str, ...]
     considered_errors: Array
     expected_nis: Mapping[str, float]
-    units_drawn: bool
+    drawn: tuple[str, ...]
     left_out: tuple[str, ...]
     beyond_linear: tuple[str, ...]
 
@@ -112,7 +112,8 @@ class Analysis(Listed):
             )
         if (worst := max(attitude, bias)) > MAX_NEES:
             optimistic = f"optimistic in {'bias' if bias > attitude else 'attitude'}: √NEES is {np.sqrt(worst):.3g}."
-            if not self.units_drawn or self._nees(self.covariance)[-1, 1:].max() > MAX_NEES:
+            same = [name not in self.drawn for name in self.fixed]
+            if all(same) or self._nees(self._moment(self.fixed_errors[:, same]))[-1, 1:].max() > MAX_NEES:
                 return f"The filter will be {optimistic}"
             return (
                 f"For a unit with exactly the specified constant errors, the filter is {optimistic} Over units (a Monte Carlo draws them) "
@@ -137,7 +138,11 @@ class Analysis(Listed):
     @property
     def second_moment(self) -> Array:
         """E[e eᵀ] of the actual error (m, 6, 6)."""
-        mean = self.mean_error
+        return self._moment(self.fixed_errors)
+
+    def _moment(self, fixed: Array) -> Array:
+        """Return :attr:`second_moment` with these fixed errors (m, f, 6)."""
+        mean = fixed.sum(axis=1)
         return np.asarray(self.covariance + mean[:, :, None] * mean[:, None, :])
 
     @property
