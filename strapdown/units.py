@@ -47,6 +47,7 @@ _STATE_UNITS: dict[str, dict[str, tuple[str, float]]] = {
     "gyro bias": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
     "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
     "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
+    "gyro temperature": {"rad/s/K": ("°/h/K", DEGREE_PER_HOUR)},
     "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},
 }
 

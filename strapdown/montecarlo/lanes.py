@@ -85,7 +85,7 @@ def supports(plan: Plan) -> str | None:
 def _reasons(plan: Plan) -> Iterator[str]:
     spec = plan.scenario.gyro
     if spec.temperature is not None:
-        yield "the gyro's bias over temperature is not supported by the lanes"
+        yield "the gyro's bias over temperature"
     for name, none in _NOT_OF_THE_GYRO.items():
         if np.any(np.asarray(getattr(spec, name)) != none):
             yield f"the gyro's {name}"
