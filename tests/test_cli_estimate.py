@@ -439,16 +439,18 @@ def test_states_of_a_direction_are_printed_relative_to_its_vector(record):
     )
     with_states = dataclasses.replace(estimate, error_states={"a bias": iron, "c bias": iron})
     cells = with_states.listing().cells
-    units = [ax.get_ylabel() for ax in sd.plots.states_over_time(with_states).axes]
-    assert units == ["% of the vector", "dimensionless"]
+    labels = [ax.get_ylabel() for ax in sd.plots.states_over_time(with_states).axes]
+    assert labels == ["% of the vector", "dimensionless"]
     assert [tuple(row[:4]) for row in cells[-6:] if row[0].endswith("x")] == [
         ("a bias x", "% of the vector", "2", "1"),
         ("c bias x", "dimensionless", "0.02", "0.01"),
     ]
     coloured = setup.SensorStates(bias_sigma=1e-7, correlated_sigma=1e-8, correlation_time=10.0)
-    for kind, unit in (("direction", "1"), ("vector", "unit of the reference")):
+    for kind, unit in (("direction", "1"), ("vector", "unit of the reference"), ("attitude", "rad")):
         blocks = setup.States(sensors={"c": coloured}).blocks({"c": kind})
         assert [block.units for block in blocks] == [(unit,) * 3] * 2
+    assert units.error_state_unit("c disturbance x", "rad") == ("arcsec", units.ARCSECOND)  # as in a scenario
+    assert units.error_state_unit("attitude x", "rad") == ("°", units.DEGREE)
 
 
 # ---------------------------------------------------------------------------------------------------- a recording of a hand

@@ -125,7 +125,7 @@ class SensorStates:
         strength = 1.0 if kind == "vector" else gravity
         # Only beside a velocity is the vector known to be a specific force.
         own = "m/s²" if self.velocity_time > 0.0 else "unit of the reference"
-        unit = own if kind == "vector" else "1"
+        unit = {"vector": own, "attitude": "rad"}.get(kind, "1")
         blocks: list[ErrorStates] = []
         if np.any(self.mounting_sigma):
             blocks.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
