@@ -60,8 +60,6 @@ def error_state_name(block: str, component: str, unit: str) -> str:
 
 def error_state_unit(name: str, unit: str) -> tuple[str, float]:
     """Return the name and the factor to SI of the printed unit of a state, from its name and SI unit."""
-    usual = {
-        "1": ("dimensionless", 1.0),
-        "rad": ("arcsec", ARCSECOND),
-    }  # rad: mounting and disturbance of a star tracker
+    # rad: mounting and disturbance of a star tracker
+    usual = {"1": ("dimensionless", 1.0), "rad": ("arcsec", ARCSECOND)}
     return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit) or usual.get(unit, (unit, 1.0))
