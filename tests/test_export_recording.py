@@ -123,6 +123,14 @@ def test_c_equals_live_ahrs_to_rounding(compiled):
     assert np.abs(np.diff(expected(name)[:, 4:7], axis=0)).max() > 1e-4  # a rest has corrected the bias
 
 
+def test_a_filter_that_looks_for_no_rest_equals_live_ahrs(tmp_path):
+    """That of any motion: the frame of its headings has no bias of a rest to drift with."""
+    rows = case("iron")[1]
+    live = LiveAhrs(interval=0.01, magnetometer=True, parameters=of_motion("any", magnetometer=True))
+    f = Compiled(design.program_of_live(live, single=False), tmp_path)
+    need_close(fed(f, rows), by_live(live, rows), angle=1e-12, bias=1e-13, variance=1e-11)
+
+
 @pytest.mark.parametrize("name", cases("iron"))
 def test_single_precision_within_a_thousandth_of_sigma(name, tmp_path):
     f = Compiled(program(name, single=True), tmp_path, single=True)

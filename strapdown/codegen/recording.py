@@ -115,6 +115,8 @@ def imu_of(f: Any, local: Callable[..., Any], passing: Callable[..., Any]) -> Im
     own[_key(imu.variance)] = View(lambda _, i: f.P[body.place(n, i, i)])
     own[_key(imu.covariance)] = [View(lambda i, j: f.P[body.place(n, min(i, j), max(i, j))])]
     own[_key(carried.covariance)] = ()
+    if not imu.rests:  # no rest, so no bias of one
+        own[_key(r.rest.rest_bias)] = View(lambda _, i: 0.0)
     written = (arrays[name] for name in live_imu.PASSING)
     for array in (*written, *carried, imu.time, imu.gyro, imu.accelerometer, imu.magnetic):
         if _key(array) not in own:
