@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import html
 import typing
 from pathlib import Path
 from typing import Any
@@ -56,9 +57,14 @@ def _section(command: Any) -> str:
 
 def _name(parameter: Any, hint: Any) -> str:
     if parameter.param_type_name == "argument":
-        return f"`{parameter.metavar or parameter.name.upper()}`"
+        return _key(parameter.metavar or parameter.name.upper())
     names = ", ".join([*parameter.opts, *parameter.secondary_opts])
-    return f"`{names}`" if parameter.is_flag else f"`{names} {parameter.metavar or _value(hint)}`"
+    return _key(names if parameter.is_flag else f"{names} {parameter.metavar or _value(hint)}")
+
+
+def _key(text: str) -> str:
+    """Return the first cell of a row, which is a row of its own on a phone."""
+    return f'<code class="key">{html.escape(text)}</code>'
 
 
 def _value(hint: Any) -> str:
