@@ -227,6 +227,16 @@ def test_hard_iron_is_estimated_as_the_unit_turns(smooth):
     np.testing.assert_allclose(result.hard_iron, IRON, atol=0.7)
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_iron_shows_where_steps_have_one_or_two_samples(smooth):
+    """At 50 Hz a step of 30 ms has, in turn, one sample and two; the changes of the field are over 1 s all the same."""
+    plain = recording(75.0, noise=0.3)
+    shifted = dataclasses.replace(plain, magnetic_field=plain.magnetic_field + 4.0 * IRON).taken(slice(None, None, 4))
+    result = ahrs.estimate(shifted, latency=0.0, smooth=smooth)
+    np.testing.assert_allclose(result.hard_iron, 4.0 * IRON, atol=1.0)
+    assert worst(result, after=40.0)["heading"] < 3.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_heading_is_better_for_it(smooth, monkeypatch):

@@ -30,7 +30,7 @@ def iron_of(field, frame, time, causal=True, known=None):
     known = np.ones(len(time), bool) if known is None else known
     if not causal:
         up = np.tile([0.0, 0.0, 1.0], (len(time), 1))
-        return hard_iron.find(field, up, frame, known, time, STRENGTH, hard_iron.SIGMA)[0]
+        return hard_iron.find(field, up, frame, known, time, STEP, STRENGTH, hard_iron.SIGMA)[0]
     others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
     constants = headings.Constants(**others | hard_iron.parts(STEP))
     memory, result = hard_iron.memory(constants.lag, 1), np.empty((len(time), 3))
@@ -111,7 +111,7 @@ def test_iron_is_as_uncertain_as_at_first_in_directions_that_no_rotation_shows(a
     frame, up = np.roll(R.as_quat(), 1, axis=-1), np.tile([0.0, 0.0, 1.0], (len(time), 1))
     field = np.tile(FIELD, (len(time), 1))
     known = np.ones(len(time), bool)
-    variance = hard_iron.find(field, up, frame, known, time, STRENGTH, 0.04)[1]
+    variance = hard_iron.find(field, up, frame, known, time, STEP, STRENGTH, 0.04)[1]
     # With A = R − R' a second apart and noise density n: (AᵀA summed over n² + I/σ²)⁻¹ along the East in body axes.
     lag = round(1.0 / STEP)
     A = R.as_matrix()[lag:] - R.as_matrix()[:-lag]

@@ -100,18 +100,20 @@ def first_variance(force: Array, field: Array, parameters: AhrsParameters) -> fl
 
 
 def smoothed(steps: kernel.Steps, start: float, parameters: AhrsParameters, interval: float) -> Headings:
-    """Return the heading measurements, each from all steps; the first sample is at ``start``, s."""
+    """Return the heading measurements, each from all steps; the first sample is at ``start``, s.
+
+    ``interval`` is that of the steps in the mean, s: those of 50 Hz are of one and two samples in turn.
+    """
     if steps.bias.any():
         steps = _without_drift(steps, interval)
     known, shown = steps.number > 0.0, steps.force_number > 0.0
-    interval = float(np.median(np.diff(steps.time, prepend=start)))
     field = _held(steps.field / np.maximum(steps.number, 1.0)[:, None], known)
     vertical = _vertical(_held(steps.force / np.maximum(steps.force_number, 1.0)[:, None], shown), interval)
     as_measured = _look(field, vertical, parameters, interval)
     measured = as_measured
     usual = float(measured.usual[0, 0])
     iron, unshown = hard_iron.find(
-        field, vertical, steps.frame, known, steps.time, usual, parameters.unshown_iron_sigma
+        field, vertical, steps.frame, known, steps.time, interval, usual, parameters.unshown_iron_sigma
     )
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.

@@ -32,7 +32,14 @@ FEIGNED = 0.028
 
 
 def find(
-    field: Array, up: Array, frame: Array, known: np.ndarray, time: Array, strength: float, sigma: float
+    field: Array,
+    up: Array,
+    frame: Array,
+    known: np.ndarray,
+    time: Array,
+    interval: float,
+    strength: float,
+    sigma: float,
 ) -> tuple[Array, Array]:
     """Return the hard iron at each row (k, 3), in the unit of the field and body axes, from the rows before and after it.
 
@@ -40,10 +47,9 @@ def find(
     of a unit that has not rotated: ``sigma`` squared.
 
     ``field`` and the vertical ``up`` (k, 3) are in the frame fixed by the integrated gyro, ``frame`` (k, 4) is the attitude by the gyro,
-    ``known`` (k,) the rows with a field, ``time`` (k,), s, has nearly equal intervals. Online, the iron is part of
+    ``known`` (k,) the rows with a field, ``time`` (k,), s, has intervals of ``interval`` s in the mean. Online, the iron is part of
     :func:`strapdown.kernels.headings.heading_steps`.
     """
-    interval = float(np.median(np.diff(time)))
     others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1, "iron_prior": sigma * sigma}
     constants, k = headings.Constants(**others | parts(interval)), len(time)
     rows = tuple(read_only(column) for column in (field, up, frame, known, time))
