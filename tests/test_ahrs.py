@@ -296,6 +296,32 @@ def test_sigma_of_the_heading_includes_iron_that_no_rotation_shows(smooth):
     assert np.sqrt((R @ known.estimate.covariance[-1, :3, :3] @ R.T)[2, 2]) < 0.4 * sigma
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_sigma_of_the_heading_includes_iron_that_small_slow_turns_hardly_show(smooth):
+    """In the mean over iron of the prior σ that swings of 0.3 rad leave nearly all in the heading."""
+    slow = functools.partial(path, turns=((0.3, 0.5), (0.3, 0.8), (0.4, 0.35)))
+    plain = recording(60.0, noise=0.3).taken(slice(None, None, 4))
+    time = plain.time - plain.time[0]
+    attitude, random = slow(time), np.random.default_rng(6)
+    noise = random.standard_normal((3, len(time), 3))
+    field = np.array([0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)])
+    squares = []
+    for iron in random.normal(0.0, 0.04 * 50.0, (12, 3)):
+        swung = dataclasses.replace(
+            plain,
+            rate=rates(time, slow) + 3e-3 * noise[0],
+            specific_force=attitude.inv().apply([0.0, 0.0, 9.81]) + 0.03 * noise[1],
+            magnetic_field=attitude.inv().apply(field) + iron + 0.3 * noise[2],
+            true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
+        )
+        result = ahrs.estimate(swung, latency=0.0, smooth=smooth, full_covariance=True)
+        R = quaternion.to_matrix(result.estimate.attitude[-1])
+        squares.append(
+            (worst(result, 59.9)["heading"] * DEGREE) ** 2 / (R @ result.estimate.covariance[-1, :3, :3] @ R.T)[2, 2]
+        )
+    assert 0.2 < np.mean(squares) < 2.0
+
+
 def in_a_hurry(duration, lever_arm=0.0, seed=3):
     """A recording of :func:`brisk`, its sensors ``lever_arm`` m along x from the point about which the unit turns."""
     time = 100.0 + np.arange(round(duration * RATE)) / RATE

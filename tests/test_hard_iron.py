@@ -117,7 +117,7 @@ def test_iron_is_as_uncertain_as_at_first_in_directions_that_no_rotation_shows(a
     A = R.as_matrix()[lag:] - R.as_matrix()[:-lag]
     k = 1500
     weight = np.exp(-np.abs(time[lag:] - time[k]) / hard_iron.MEMORY)
-    N = np.einsum("k,kij,kil->jl", weight, A, A) * STEP / hard_iron.CHANGE_NOISE**2 + np.eye(3) / 0.04**2
+    N = np.einsum("k,kij,kil->jl", weight, A, A) * STEP / hard_iron.LEFT_NOISE**2 + np.eye(3) / 0.04**2
     east = R[k].inv().apply([1.0, 0.0, 0.0])
     np.testing.assert_allclose(variance[k], east @ np.linalg.solve(N, east), rtol=0.1)
     assert (variance[k] > 0.9 * 0.04**2) == (axis in (None, [1.0, 0.0, 0.0]))

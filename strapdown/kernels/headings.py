@@ -50,6 +50,8 @@ class Constants(NamedTuple):
     """Duration over which the change of the field is computed, s."""
     ridge: float
     """Squared ratio of the noise of the change to the prior σ of the iron."""
+    left_ridge: float
+    """The same of the noise with which the filter's states learn weak iron, which is left to them."""
     feigned: float
     negligible: float
     deviation_odds: float
@@ -183,10 +185,9 @@ def iron_of_all(constants, rows, strength, before, iron, unshown):
             equations = equations_until(constants, field, frame, known, time, strength, k + constants.lag)
             sums = approached(constants.iron_share, sums, equations)
         total = added(before, k, sums)
-        factor = normal_factor(constants, total)
-        store_row(iron, k, iron_of(constants, factor, total, strength))
+        store_row(iron, k, iron_of(constants, total, strength))
         R = rotation_matrix(quaternion_at(frame, k))
-        unshown[k] = variance_across(constants, factor, R, vector_at(field, k), vector_at(up, k))
+        unshown[k] = variance_across(constants, total, R, vector_at(field, k), vector_at(up, k))
 
 
 def heading_step(constants, steps, memory, out, k):
@@ -261,7 +262,7 @@ def look_at_field(constants, steps, memory, out, k, known, drift):
     strength = memory.strength[0]
     iron = iron_step(constants, field, frame, known, steps.time[k], strength, memory)
     R = rotation_matrix(frame)
-    unshown = variance_across(constants, normal_factor(constants, memory.sums), R, field, up)
+    unshown = variance_across(constants, memory.sums, R, field, up)
     look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up, forgotten)
     # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
     odds = min(max((memory.deviation[0] - memory.deviation[1]) / constants.deviation_odds, -50.0), 0.0)
@@ -380,9 +381,9 @@ def equations_of(field, frame, then, old, strength):
     )
 
 
-def normal_factor(constants, sums):
+def normal_factor(constants, sums, ridge):
     """Return the factor of the normal matrix of the iron, from low-passed equations and the prior σ."""
-    h, ridge = constants.iron_interval, constants.ridge
+    h = constants.iron_interval
     normal = (
         h * sums[0] + ridge,
         h * sums[1],
@@ -394,20 +395,21 @@ def normal_factor(constants, sums):
     return factored(normal)
 
 
-def variance_across(constants, factor, R, field, up):
+def variance_across(constants, sums, R, field, up):
     """Return the variance of the iron, relative to the squared magnitude, in the horizontal direction across the field.
 
     Such iron turns the heading. Iron that no rotation has distinguished from the field of the surroundings is as uncertain as at first.
     """
     across = cross(field, up)
     across = transpose_times_vector(R, scale(1.0 / math.sqrt(max(dot(across, across), 1e-30)), across))
-    return constants.iron_prior * constants.ridge * dot(across, solved(factor, across))
+    shown = solved(normal_factor(constants, sums, constants.left_ridge), across)
+    return constants.iron_prior * constants.left_ridge * dot(across, shown)
 
 
-def iron_of(constants, factor, sums, strength):
+def iron_of(constants, sums, strength):
     """Return the iron by low-passed equations, less what a field that varies along the path feigns."""
     h = constants.iron_interval
-    iron = solved(factor, (h * sums[6], h * sums[7], h * sums[8]))
+    iron = solved(normal_factor(constants, sums, constants.ridge), (h * sums[6], h * sums[7], h * sums[8]))
     less = 1.0 - constants.feigned * constants.feigned / max(dot(iron, iron), 1e-30)
     return scale(strength * max(less, 0.0), iron)
 
@@ -428,7 +430,7 @@ def iron_step(constants, field, frame, known, time, strength, memory):
     memory.ring_time[r] = time
     for i in range(9):
         sums[i] += constants.iron_share * (equations[i] - sums[i])
-    iron = iron_of(constants, normal_factor(constants, sums), sums, strength)
+    iron = iron_of(constants, sums, strength)
     for i in range(3):
         memory.iron[i] += constants.rise_share * (iron[i] - memory.iron[i])
     iron = (memory.iron[0], memory.iron[1], memory.iron[2])
