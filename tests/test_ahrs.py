@@ -559,6 +559,15 @@ def test_a_span_without_samples_of_the_accelerometer_is_no_rest():
     np.testing.assert_array_equal(rests_of(dataclasses.replace(quiet, specific_force=force)).last, [199, 599])
 
 
+@pytest.mark.parametrize("every", [2, 10])
+def test_an_accelerometer_of_a_lower_rate_than_the_gyros_shows_a_rest(every):
+    """Phones sample it at half the gyro's rate."""
+    quiet = quiet_second((4.0, -3.0, 2.0))
+    force = quiet.specific_force.copy()
+    force[np.arange(len(force)) % every > 0] = np.nan
+    np.testing.assert_array_equal(rests_of(dataclasses.replace(quiet, specific_force=force)).last, [199, 399, 599])
+
+
 @pytest.mark.parametrize("rate", [(0.3, -0.2, 0.1), (4.0, -3.0, 2.0)])
 def test_the_mean_rate_at_rest_measures_the_bias_however_large(rate):
     rests = rests_of(quiet_second(rate))

@@ -305,7 +305,7 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
 def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
     """Return the kernel's memory before the first sample."""
     return kernel.Memory(
-        tenths=np.zeros((rest_length(interval)[0], 3)),
+        tenths=np.zeros((rest_length(interval)[0], 4)),
         halves=np.zeros((4, 3)),
         halves_number=np.zeros(4, np.int64),
         resting=np.zeros(2, np.int64),

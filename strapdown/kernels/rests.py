@@ -44,7 +44,7 @@ class Memory(NamedTuple):
     """What lasts from one sample to the next."""
 
     tenths: np.ndarray
-    """Sums of the rate over the parts of the span (parts, 3)."""
+    """Sums of the rate over the parts of the span, and number of the accelerometer's samples (parts, 4)."""
     halves: np.ndarray
     """Sums of specific force and field over its halves (4, 3)."""
     halves_number: np.ndarray
@@ -87,8 +87,10 @@ def find_rests(constants, time, rate, force, field, memory, means):
         k = memory.resting[0]
         if k == 0:
             memory.rest_clock[0] = time[i]
-        add(memory.tenths, k // constants.part, vector_at(rate, i))
-        half = k // ((length + 1) // 2)
+        part, half = k // constants.part, k // ((length + 1) // 2)
+        add(memory.tenths, part, vector_at(rate, i))
+        if is_sample(vector_at(force, i)):
+            memory.tenths[part, 3] += 1.0
         add_known(memory, half, vector_at(force, i))
         if len(field) > 0:
             add_known(memory, 2 + half, vector_at(field, i))
@@ -108,9 +110,14 @@ def add(sums, row, vector):
         sums[row, i] += vector[i]
 
 
+def is_sample(vector):
+    """Return whether a specific force or a field is not missing."""
+    return 0.0 < dot(vector, vector) < math.inf
+
+
 def add_known(memory, row, vector):
     """Add a sample of specific force or field to the sums over a half of the span, unless it is missing."""
-    if 0.0 < dot(vector, vector) < math.inf:
+    if is_sample(vector):
         memory.halves_number[row] += 1
         add(memory.halves, row, vector)
 
@@ -122,7 +129,7 @@ def clear_span(memory):
         memory.halves_number[i] = 0
     for sums in (memory.tenths, memory.halves):
         for i in range(len(sums)):
-            for j in range(3):
+            for j in range(sums.shape[1]):
                 sums[i, j] = 0.0
 
 
@@ -138,8 +145,9 @@ def find_rest(constants, time, memory):
     for i in range(parts):
         rate = combine(1.0, rate, 1.0 / part, vector_at(memory.tenths, i))
     rate = (rate[0] / parts, rate[1] / parts, rate[2] / parts)
-    spread = 0.0
+    spread, covered = 0.0, 0.0
     for i in range(parts):
+        covered += min(memory.tenths[i, 3], 1.0)
         off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
         spread += dot(off, off)
     variance = constants.own_variance + spread / parts
@@ -156,7 +164,7 @@ def find_rest(constants, time, memory):
     still = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
-        and memory.halves_number[0] + memory.halves_number[1] > parts * part // 2
+        and 2.0 * covered > parts
         and not turns
         and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
     )
