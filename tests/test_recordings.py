@@ -281,6 +281,16 @@ def test_a_row_for_each_sensor_is_one_recording(csv):
     np.testing.assert_array_equal(recording.specific_force, [[k, 2, 9] for k in range(4)])
 
 
+def test_samples_for_which_there_is_no_row_of_the_gyro_are_counted(csv):
+    rows = [
+        f"{0.01 * k:.2f},{k},0,0,,,\n{0.01 * k + 0.004:.3f},,,,{k},2,9\n{0.01 * k + 0.0049:.4f},,,,7,2,9"
+        for k in range(4)
+    ]
+    assert read(csv(rows=rows)).remarks == (
+        "4 of 8 samples of the accelerometer were left out: others are nearer to the gyro's.",
+    )
+
+
 def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     """A logger that writes a row twice; the same stamp with another sample is refused, and named."""
     rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(6)]

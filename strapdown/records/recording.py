@@ -255,12 +255,16 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                 f"{source}: {np.sum(known)} of {len(known)} rows have a whole gyro sample; at least 2 are needed"
             )
         stamps = increasing(f"{source}: time", columns["time"])
-        moved = {}
-        for name in ("specific_force", "magnetic_field", "temperature"):
-            if (values := columns.get(name)) is not None and len(values) == len(known):
+        moved, remarks = {}, columns.get("remarks", ())
+        for sensor in ("accelerometer", "magnetometer", "temperature"):
+            if (values := columns.get(name := FIELDS[sensor])) is not None and len(values) == len(known):
                 there = ~np.isnan(values.reshape(len(values), -1)).any(axis=1)
-                moved[name] = at_nearest(stamps[known], stamps[there], values[there])[0]
-        columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known]}
+                moved[name], lost = at_nearest(stamps[known], stamps[there], values[there])
+                if lost:
+                    remarks += (
+                        f"{lost} of {there.sum()} samples of the {sensor} were left out: others are nearer to the gyro's.",
+                    )
+        columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known], "remarks": remarks}
     return Recording(source=source, **columns)
 
 
