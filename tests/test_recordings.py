@@ -240,6 +240,16 @@ def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark)
         np.testing.assert_array_equal(recording.specific_force, plain.specific_force)
 
 
+def test_columns_separated_by_spaces_and_lines_above_the_header_are_reported(csv):
+    spaced = csv(HEADER.replace(",", " "), [row.replace(",", " ") for row in ROWS])
+    refused(spaced, "is one column", "separate columns by comma")
+    refused(
+        csv(f"Device: A\nMade by: B\n\n{HEADER}"),
+        "'Device: A Made by: B', is one column",
+        "delete lines above the header",
+    )
+
+
 @pytest.mark.parametrize(("columns", "name"), [("ax [m/s2],ay,az", "specific_force"), ("mx,my,mz", "magnetic_field")])
 def test_a_sensor_of_zeros_is_reported(csv, columns, name):
     rows = [f"{k / 100},0.1,0.2,0.3,0,0,{'' if k == 1 else 0}" for k in range(3)]
