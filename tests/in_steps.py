@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from gated_steps import GatedStepFilter
 from measured import correlation, state_errors
 
@@ -24,25 +25,26 @@ def transition_and_noise(phi, dt, process_noise):
     return F, covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
-def fed(f, record, after=lambda used: None):
-    """Process a record, intervals split at the measurements; return attitudes, biases and covariances at the ends of the intervals.
+def fed(f, record, after=lambda sensor: None):
+    """Process a record, intervals split at the measurements; return attitudes, biases, values and covariances at its edges.
 
-    ``after`` is called after each measurement, with whether it was used.
+    ``after`` is called after each measurement, with its sensor.
     """
     events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
-    rows = []
-    for n, delta in enumerate(record.increments):
-        now, end = record.time[n], record.time[n + 1]
-        whole = end - now
+    events = [event for event in events if event[0] >= record.time[0]]
+    rows, now, increments = [], record.time[0], [np.zeros(3), *record.increments]
+    for end, whole, delta in zip(record.time, np.diff(record.time, prepend=now), increments, strict=True):
         while events and events[0][0] <= end:
             t, i, k = events.pop(0)
             if t > now:
                 f.predict(delta * ((t - now) / whole), t - now)
-                now = t
-            after(f.update(record.vectors[i], k))
+                now = f.time = t
+            f.update(record.vectors[i], k)
+            after(record.vectors[i].sensor)
         if end > now:
             f.predict(delta * ((end - now) / whole), end - now)
-        rows.append((f.attitude, f.bias, f.P))
+            now = f.time = end
+        rows.append((f.attitude, f.bias, f.values, f.P))
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
@@ -50,49 +52,31 @@ def run(record, process_noise, initial, error_states=(), **options):
     """Return the result of the step-by-step filter for a record: states at every edge, innovations, counts and events."""
     sensors = [series.sensor for series in record.vectors]
     f = GatedStepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
-    events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
-    events = [event for event in events if event[0] >= record.time[0]]
-    rows, updates = [], {sensor: [] for sensor in sensors}
+    updates, skipped = {sensor: [] for sensor in sensors}, dict.fromkeys(sensors, 0)
 
-    def give_until(end):
-        now = f.time
-        while events and events[0][0] <= end:
-            t, i, k = events.pop(0)
-            if t > now:
-                f.predict(delta * ((t - now) / whole), t - now)
-                now = f.time = t
-            series, skipped = record.vectors[i], sum(f.skipped.values())
-            f.update(series, k)
-            if sum(f.skipped.values()) == skipped:
-                updates[series.sensor].append((f.nis, f.weight, f.y, f.S))
-        return now
+    def note(sensor):
+        if f.skipped.get(sensor, 0) == skipped[sensor]:
+            updates[sensor].append((f.nis, f.weight, np.linalg.solve(np.linalg.cholesky(f.S), f.y)))
+        else:
+            skipped[sensor] += 1
 
-    whole, delta = 0.0, np.zeros(3)
-    give_until(record.time[0])
-    rows.append((f.attitude, f.bias, f.values, f.P))
-    for n, delta in enumerate(record.increments):
-        end = record.time[n + 1]
-        whole = end - record.time[n]
-        now = give_until(end)
-        if end > now:
-            f.predict(delta * ((end - now) / whole), end - now)
-            f.time = end
-        rows.append((f.attitude, f.bias, f.values, f.P))
-    attitude, bias, values, P = (np.array(column) for column in zip(*rows, strict=True))
+    attitude, bias, values, P = fed(f, record, note)
     ends = np.cumsum([block.size for block in error_states])[:-1]
+    nis, weight, whitened = (
+        {sensor: np.array([update[part] for update in history]) for sensor, history in updates.items()}
+        for part in range(3)
+    )
     return SimpleNamespace(
         attitude=attitude,
         bias=bias,
         values=dict(zip([block.name for block in error_states], np.split(values, ends, axis=1), strict=False)),
         whole_covariance=P,
-        nis={sensor: np.array([update[0] for update in history]) for sensor, history in updates.items()},
-        weight={sensor: np.array([update[1] for update in history]) for sensor, history in updates.items()},
-        whitened={
-            sensor: np.array([whitened(*update[2:]) for update in history]) for sensor, history in updates.items()
-        },
+        nis=nis,
+        weight=weight,
+        whitened=whitened,
         refused={sensor: f.refused.get(sensor, 0) for sensor in sensors},
-        skipped={sensor: f.skipped.get(sensor, 0) for sensor in sensors},
-        events=tuple(sorted([*estimation.gaps(record), *f.events], key=lambda event: event.start)),
+        skipped=skipped,
+        events=(*estimation.gaps(record), *f.events),
     )
 
 
@@ -104,6 +88,20 @@ def apart(whole, step):
     return max(np.max(off), np.max(np.abs(correlation(P - step.whole_covariance, sigma))))
 
 
-def whitened(y, S):
-    """Return an innovation decorrelated in the order of its rows and divided by its standard deviations."""
-    return np.linalg.solve(np.linalg.cholesky(S), y)
+def assert_alike(whole, step, tolerance):
+    """Assert that the compiled filter's result is this one's: states to ``tolerance``, innovations, weights, counts and events."""
+    assert apart(whole, step) < tolerance
+    assert (whole.refused, whole.skipped) == (step.refused, step.skipped)
+    both = [
+        sorted(result.events, key=lambda event: (event.kind, event.sensor, event.start)) for result in (whole, step)
+    ]
+    assert len(both[0]) == len(both[1])
+    for a, b in zip(*both, strict=True):
+        assert (a.kind, a.sensor) == (b.kind, b.sensor)
+        assert (a.start, a.end, a.value) == pytest.approx((b.start, b.end, b.value))
+    for sensor, innovations in whole.innovations.items():
+        np.testing.assert_allclose(step.nis[sensor], innovations.nis, rtol=1e-7, atol=1e-9)
+        if innovations.weight is None:
+            np.testing.assert_allclose(step.whitened[sensor], innovations.whitened, rtol=1e-9, atol=1e-9)
+        else:
+            np.testing.assert_allclose(step.weight[sensor], innovations.weight, atol=1e-9)

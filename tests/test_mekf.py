@@ -45,7 +45,7 @@ def test_the_step_face_keeps_what_filterpys_users_expect():
     record = simulate(scenario(duration=2.0), 1)
     f = StepFilter(NOISE, off(record))
     history = Saver(f)
-    in_steps.fed(f, record, lambda used: history.save())
+    in_steps.fed(f, record, lambda sensor: history.save())
     assert {np.shape(y)[0] for y in history.y} == {1, 2}
     assert all(np.shape(K) == (6, np.shape(y)[0]) for K, y in zip(history.K, history.y, strict=True))
     assert np.array_equal(history.x[-1], np.zeros(6))
