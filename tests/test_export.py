@@ -25,7 +25,6 @@ from strapdown.estimation.setup import SensorStates, States
 NOISE = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 GATE = sd.Gate(recovery=None)
 RATE = 50.0
-TILT = [[4e-4, 1e-4, 0.0], [1e-4, 2e-4, 0.0], [0.0, 0.0, 3e-4]]
 
 SENSORS = {
     "direction": sd.VectorSensor(name="star", reference_f=[0.6, 0.0, 0.8], sigma=0.02, rate=10.0),

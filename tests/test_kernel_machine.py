@@ -580,14 +580,19 @@ for names in arguments:
 """
 
 
-def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
-    """One loop, two bodies of the same types: neither may be taken for the other, whichever was compiled first."""
-    kernels, root = copied_kernels, copied_kernels.parent.parent
-    (kernels / "open_probe.py").write_text(OPEN_PROBE)
+@pytest.fixture
+def two_bodies(copied_kernels):
+    """A kernel that leaves a function open, and the names of two modules that define it."""
+    (copied_kernels / "open_probe.py").write_text(OPEN_PROBE)
     for number in (3, 7):
-        (kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
+        (copied_kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
+    return copied_kernels.parent.parent, *(f"strapdown.kernels.term_{number}" for number in (3, 7))
+
+
+def test_cache_distinguishes_what_open_functions_are_bound_to(two_bodies):
+    """One loop, two bodies of the same types: neither may be taken for the other, whichever was compiled first."""
+    root, three, seven = two_bodies
     ask = partial(in_a_new_process, root, ASK_PARTS)  # value and hits of each body
-    three, seven = (f"strapdown.kernels.term_{number}" for number in (3, 7))
     own = root / "own.py"  # a body of one's own, outside the package
     own.write_text("def term(x):\n    return 3.0 * x\n")
     assert ask(three, seven, "own") == [(6.0, 0), (14.0, 0), (6.0, 0)]
@@ -612,13 +617,9 @@ answer = answer, hits
 """
 
 
-def test_addresses_are_those_of_each_body_whichever_process_compiled_it(copied_kernels):
+def test_addresses_are_those_of_each_body_whichever_process_compiled_it(two_bodies):
     """numba numbers functions from the start of each process: without the body in their names, two symbols would be one."""
-    kernels, root = copied_kernels, copied_kernels.parent.parent
-    (kernels / "open_probe.py").write_text(OPEN_PROBE)
-    for number in (3, 7):
-        (kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
-    three, seven = (f"strapdown.kernels.term_{number}" for number in (3, 7))
+    root, three, seven = two_bodies
     ask = partial(in_a_new_process, root, ASK_ADDRESSES)
     assert ask(three) == ([6.0], [(6.0, 0)])
     assert ask(seven) == ([14.0], [(14.0, 0)])
