@@ -51,42 +51,6 @@ def test_the_scenario_at_rest_gives_its_preset_back(succeeds, tmp_path):
     assert "WARNING" not in text
 
 
-ACCELEROMETER = """
-seed = 3
-rate_hz = 50.0
-duration_s = 120.0
-
-[motion]
-type = "rest"
-
-[gyro]
-angle_random_walk_deg_per_sqrt_hour = 0.15
-
-[[sensors]]
-type = "accelerometer"
-name = "accelerometer"
-kind = "vector"
-sigma_m_per_s2 = 0.02
-rate_hz = 50.0
-"""
-
-
-def test_a_simulated_accelerometer_at_rest_gives_the_file_of_kalibr(succeeds, refusal, tmp_path):
-    (tmp_path / "rest.toml").write_text(ACCELEROMETER, encoding="utf-8")
-    succeeds("simulate", "rest.toml")
-    both = ("--sensor", "gyro", "--sensor", "accelerometer", "--kalibr")
-    succeeds("allan", "rest.h5", *both)
-    lines = (tmp_path / "allan-results" / "imu.yaml").read_text(encoding="utf-8").splitlines()
-    values = {
-        name: float(rest.split()[0]) for name, _, rest in (line.partition(": ") for line in lines) if rest[:1].isdigit()
-    }
-    assert values["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.03)
-    assert values["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.03)
-    (tmp_path / "unit.toml").write_text(ACCELEROMETER.replace('kind = "vector"\n', ""), encoding="utf-8")
-    succeeds("simulate", "unit.toml")
-    assert 'simulate it with kind = "vector"' in refusal("allan", "unit.h5", *both, "--out", "other")
-
-
 def test_terms_not_seen_are_left_out_and_bounded_in_comments(succeeds, tmp_path):
     walking = white()
     walking[:, 2] += np.cumsum(3e-5 * np.random.default_rng(2).standard_normal(20_000))
@@ -140,29 +104,6 @@ def test_a_record_of_something_else_is_said_in_the_file_and_last(succeeds, tmp_p
     assert min(content["misfit_probability"][0], content["misfit_probability"][2]) > 1e-3
 
 
-def test_highest_frequency_leaves_a_line_out(run, succeeds, tmp_path):
-    rates = white(4000, axes=1) + 3e-3 * np.sin(2.0 * np.pi * 31.0 * 0.01 * np.arange(4000))[:, None]
-    np.save(tmp_path / "gyro.npy", rates)
-    assert "do not trust" in run("allan", "gyro.npy", *AT_100_HZ)[1]
-    said = succeeds("allan", "gyro.npy", *AT_100_HZ, "--highest-frequency", 25)
-    assert "do not trust" not in said
-    spec, _ = written(tmp_path)
-    assert np.all(np.abs(spec.angle_random_walk / NOISE - 1.0) < 0.05)
-
-
-def test_npy_csv_and_units_agree(succeeds, tmp_path):
-    rates = white(4096)
-    np.save(tmp_path / "gyro.npy", rates)
-    time = 0.01 * np.arange(4096)
-    header = "time [ms],gx [deg/s],gy [deg/s],gz [deg/s]"
-    columns = np.column_stack([1000.0 * time, np.degrees(rates)])
-    np.savetxt(tmp_path / "gyro.csv", columns, delimiter=",", header=header, comments="", fmt="%.17g")
-    succeeds("allan", "gyro.npy", *AT_100_HZ, "--out", "a")
-    succeeds("allan", "gyro.csv", "--out", "b")
-    from_npy, from_csv = written(tmp_path, "a")[0], written(tmp_path, "b")[0]
-    np.testing.assert_allclose(from_npy.angle_random_walk, from_csv.angle_random_walk, rtol=3e-6)
-
-
 @pytest.mark.parametrize(
     ("values", "options", "words"),
     [
@@ -185,14 +126,6 @@ def test_bad_records_end_with_one_clear_line_and_nothing_written(refusal, tmp_pa
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert not list(tmp_path.glob("allan-results/*"))
-
-
-def test_truncated_files_and_folders_are_refused(run, tmp_path):
-    np.save(tmp_path / "whole.npy", white(300))
-    (tmp_path / "cut.npy").write_bytes((tmp_path / "whole.npy").read_bytes()[:1000])
-    assert "truncated" in run("allan", "cut.npy", *AT_100_HZ)[2]
-    assert "does not exist" in run("allan", "none.h5")[2]
-    assert "is a folder" in run("allan", ".")[2]
 
 
 # Specification → simulation → Allan → specification, through the public functions alone

@@ -719,9 +719,7 @@ def test_the_kernels_are_compiled_once_for_a_structure():
 
 
 @pytest.mark.parametrize(
-    ("prior", "sigma", "bound"),
-    [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)],
-    ids=["1 arcsecond", "anywhere, 0.2 arcseconds"],
+    ("prior", "sigma", "bound"), [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)], ids=["1 arcsecond", "anywhere, 0.2 arcseconds"]
 )
 def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
     """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""

@@ -149,10 +149,7 @@ DRIFTING = States(
     gyro_drift_sigma=(2e-3,),
     gyro_drift_time=(8.0,),
     gyro_fast_bias_sigma=1e-4,
-    sensors={
-        "mag": SensorStates(bias_sigma=3e-6),
-        "force": SensorStates(correlated_sigma=0.01, correlation_time=0.7),
-    },
+    sensors={"mag": SensorStates(bias_sigma=3e-6), "force": SensorStates(correlated_sigma=0.01, correlation_time=0.7)},
 )
 """In the structure of :data:`measured.EVERY_KIND`."""
 

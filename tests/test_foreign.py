@@ -641,8 +641,7 @@ def test_odometry_and_poses_are_read_from_bags(replayed, tmp_path):
             header=header(k), child_frame_id="base_link", pose=pose(k), twist=twist
         ),
         "geometry_msgs/msg/PoseWithCovarianceStamped": lambda k: t["geometry_msgs/msg/PoseWithCovarianceStamped"](
-            header=header(k),
-            pose=pose(k, known=k < 2),
+            header=header(k), pose=pose(k, known=k < 2)
         ),
     }
     folder = tmp_path / "bag"

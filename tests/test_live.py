@@ -45,8 +45,7 @@ def record_for(states):
         return record
     directions = (s for s in record.vectors if s.kind == "direction")
     return replace(
-        record,
-        vectors=tuple(replace(s, kind="vector", reference_f=unit(s.reference_f)) for s in directions),
+        record, vectors=tuple(replace(s, kind="vector", reference_f=unit(s.reference_f)) for s in directions)
     )
 
 

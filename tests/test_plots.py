@@ -18,15 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from strapdown import (
-    allan,
-    consistency,
-    covariance,
-    montecarlo,
-    plots,
-    quaternion,
-    units,
-)
+from strapdown import allan, consistency, covariance, montecarlo, plots, quaternion, units
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
@@ -358,10 +350,7 @@ def test_error_states_are_drawn_with_three_sigma(run):
     estimate, _ = run
     every = np.ones((len(estimate.time), 1))
     block = ErrorStateEstimate(
-        components=("x", "y"),
-        units=("1", "1"),
-        values=every * [1e-4, -2e-4],
-        variance=every * [1e-10, 4e-10],
+        components=("x", "y"), units=("1", "1"), values=every * [1e-4, -2e-4], variance=every * [1e-10, 4e-10]
     )
     (ax,) = plots.states_over_time(dataclasses.replace(estimate, error_states={"gyro scale": block})).axes
     assert ax.get_ylabel() == "ppm"

@@ -317,10 +317,7 @@ def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     both = read(csv(rows=[*rows[:2], missing, missing, *rows[3:]]))
     np.testing.assert_array_equal(both.repeated, [0.02])
     np.testing.assert_array_equal(both.missing_gyro, [0.02])
-    with pytest.raises(
-        InputError,
-        match=r"other samples: 1 of 7, the first 0\.02 s in row 4",
-    ):
+    with pytest.raises(InputError, match=r"other samples: 1 of 7, the first 0\.02 s in row 4"):
         read(csv(rows=[*rows[:3], rows[2].replace("0.2,0,0", "0.3,0,0"), *rows[3:]]))
 
 
@@ -541,6 +538,12 @@ def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_m
     other = recordings.read_samples(tmp_path / "record.h5", "accelerometer")
     np.testing.assert_array_equal(other.values, force.vector_b)
     assert (other.kind, other.sample_interval) == ("rate", pytest.approx(0.04, rel=1e-12))
+    direction = series_of("accelerometer", "direction", [0.5], [[0.0, 0.0, 1.0]], [0.0, 0.0, 1.0], 0.1)
+    recordfiles.write_record(
+        tmp_path / "unit.h5", ImuRecord(time=time, increments=record.increments, vectors=(direction,))
+    )
+    with pytest.raises(InputError, match='simulate it with kind = "vector"'):
+        recordings.read_samples(tmp_path / "unit.h5", "accelerometer")
 
 
 def test_gaps_are_intervals_of_more_than_five_median_ones():

@@ -244,10 +244,7 @@ def test_foreign_files_are_refused(tmp_path):
     with h5py.File(tmp_path / "half.h5", "w") as file:
         file.attrs["kind"] = "strapdown estimate"
         file["time"] = np.arange(3.0)
-    for name, words in (
-        ("other", "is not a strapdown estimate"),
-        ("half", "is damaged: its digest is missing"),
-    ):
+    for name, words in (("other", "is not a strapdown estimate"), ("half", "is damaged: its digest is missing")):
         with pytest.raises(InputError, match=rf"{name}\.h5 ?{words}"):
             read_estimate(tmp_path / f"{name}.h5")
 
