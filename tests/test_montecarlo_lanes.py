@@ -244,8 +244,8 @@ def test_the_noise_of_a_tilted_tracker_is_that_about_its_boresight(monkeypatch):
     """Drawn with the filter of isotropic noise behind it, whose kernel is there already: what is drawn does not depend on it."""
     plan = Plan(scenario=replace(SCENARIO, sensors=(SENSORS["tilted"],)), setup=SETUP, seed=9, epochs=20, nis_bins=8)
     prepared = lanes._prepare(plan)
-    assert lanes.montecarlo_six not in prepared.parts
-    monkeypatch.setitem(lanes._PREPARED, plan, replace(prepared, parts=(lanes.montecarlo_six,)))
+    assert prepared.filter is not lanes.montecarlo_six
+    monkeypatch.setitem(lanes._PREPARED, plan, replace(prepared, filter=lanes.montecarlo_six))
     errors_b = []
     for run in range(30):
         tracker = lanes.replay(plan, run).record.vectors[0]
