@@ -104,12 +104,13 @@ def test_a_unit_that_hardly_moves_is_left_to_the_filter():
     assert after[0] == pytest.approx(starting.MAX_TILT_SIGMA**2)
 
 
-def test_the_heading_is_kept_without_a_field():
+@pytest.mark.parametrize("field", [0.0, 30.0], ids=["no field", "a field along the vertical"])
+def test_the_heading_is_kept_without_a_horizontal_field(field):
     q = Rotation.from_euler("ZYX", [70.0, 20.0, -30.0], degrees=True)
     x = np.concatenate([np.roll(q.as_quat(), 1), np.zeros(3)])
     P = np.diag([0.01, 0.02, 0.03, 1e-4, 1e-4, 1e-4]) + 1e-4
     up = 9.0 * q.inv().apply([0.5, 0.1, 0.9])  # nearer to East than to North
-    starting.align(x, P, up, np.zeros(3), 0.04, ahrs.AhrsParameters(), afresh=True)
+    starting.align(x, P, up, field * up, 0.04, ahrs.AhrsParameters(), afresh=True)
     R = quaternion.to_matrix(x[:4])
     np.testing.assert_allclose(R[2], up / np.linalg.norm(up), atol=1e-12)
     # The horizontal axis that is kept: North, projected on the new horizon.

@@ -63,6 +63,9 @@ class LiveAhrs:
     sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
     the end of a recording ends a step of the filter. Samples before the first complete one are not used.
 
+    A gap of the samples is bridged by the mean of the rates at its ends. σ does not grow over it as in ``estimate``, which knows from the
+    whole recording how the rate changes. If the unit may have turned in a gap of some tenths of a second or more, start a new filter.
+
     The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here.
 
     Examples

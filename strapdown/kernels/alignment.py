@@ -104,6 +104,9 @@ SIZE = 10
 AGREES = 1.5
 """Difference of the filter's vertical from the mean, in σ of the mean, up to which the filter is left as it is."""
 
+MIN_HORIZONTAL = 1e-6
+"""Squared sine of the angle between field and vertical up to which the field gives no heading."""
+
 
 class Constants(NamedTuple):
     """Constants of the coarse alignment, and of a unit."""
@@ -201,7 +204,8 @@ def departs(q, force, tilt):
 def aligned(constants, force, field, tilt, q, covariance):
     """Return the attitude by mean specific force and field, body axes, and the variance of its heading in addition to that by the tilt.
 
-    Without a field (zero) the heading of the attitude ``q`` is kept, with its variance in ``covariance`` (xx, xy, xz, yy, yz, zz).
+    Without a field (zero), or with one along the force, the heading of the attitude ``q`` is kept, with its variance in ``covariance`` (xx,
+    xy, xz, yy, yz, zz).
     """
     up = direction(force)
     R = rotation_matrix(q)
@@ -209,6 +213,7 @@ def aligned(constants, force, field, tilt, q, covariance):
     across, heading = cross(up, east), dot(up, symmetric_times_vector(covariance, up))
     if abs(dot(up, north)) < abs(dot(up, east)):
         across = north
-    if dot(field, field) > 0.0:
+    square, vertical = dot(field, field), dot(up, field)
+    if square - vertical * vertical > MIN_HORIZONTAL * square:
         across, heading = field, heading_variance(constants, sine_of_dip(force, field), tilt)
     return first_attitude(force, across), heading
