@@ -70,6 +70,27 @@ def test_the_attitude_after_a_gap_is_found_again():
         assert np.all(angle[after + 160 : after + 500] < np.minimum(3.0 * sigma[after + 160 : after + 500], 0.5))
 
 
+@pytest.mark.parametrize("magnetometer", [False, True])
+def test_after_a_gap_the_live_filter_finds_the_vertical_again(magnetometer):
+    """Its σ grows with the first sample after the gap, and covers the error from then on."""
+    for seed in range(6):
+        runner = run_with(seed, 24.0, magnetometer=magnetometer, amplitude=2.0)
+        cut = runner.taken(np.flatnonzero(np.abs(runner.time - 13.0 - 0.1 * seed) > 3.0))
+        live = ahrs.LiveAhrs(interval=1.0 / RATE, magnetometer=magnetometer)
+        after = np.flatnonzero(np.diff(cut.time) > 1.0)[0] + 1
+        tilts = []
+        for k in range(after + 500):
+            field = None if cut.magnetic_field is None else cut.magnetic_field[k]
+            live.update(cut.time[k], cut.rate[k], cut.specific_force[k], field)
+            up, true_up = (quaternion.to_matrix(q)[2] for q in (live.attitude, cut.true_attitude[k]))
+            R = quaternion.to_matrix(live.attitude)
+            C = R @ live.covariance[:3, :3] @ R.T
+            tilts.append((np.arccos(min(up @ true_up, 1.0)), np.sqrt(C[0, 0] + C[1, 1])))
+        angle, sigma = np.array(tilts[after:]).T
+        assert sigma[0] > 1.0
+        assert np.all(angle[160:] < np.minimum(3.0 * sigma[160:], 0.6))
+
+
 def test_the_mean_of_an_acceleration_that_changes_is_the_vertical():
     """Over whole periods the mean is exact; the variation gives σ."""
     k, every = 40, 0.025
@@ -84,7 +105,7 @@ def test_the_mean_of_an_acceleration_that_changes_is_the_vertical():
         end=np.roll(attitude.as_quat(), 1, axis=-1),
     )
     parameters = ahrs.AhrsParameters()
-    out = starting.alignments(steps, every, parameters, afresh=True)
+    out = starting.alignments(steps, every, parameters, unknown=False)
     at = np.flatnonzero(out.variance > 0.0)
     np.testing.assert_allclose((at + 1) * every, [0.075, 0.125, 0.25, 0.5, 1.0], atol=1e-9)
     np.testing.assert_allclose(out.force[at[2:]], attitude[at[2:]].inv().apply(np.tile(GRAVITY, (3, 1))), atol=1e-9)
@@ -98,9 +119,9 @@ def test_a_unit_that_hardly_moves_is_left_to_the_filter():
     steps = alignment.Steps(
         np.tile(GRAVITY, (50, 1)), np.ones(50), np.empty((0, 3)), np.empty(0), np.tile([1.0, 0.0, 0.0, 0.0], (50, 1))
     )
-    assert not starting.alignments(steps, 0.03, ahrs.AhrsParameters(), afresh=True).variance.any()
+    assert not starting.alignments(steps, 0.03, ahrs.AhrsParameters(), unknown=False).variance.any()
     # After a gap it is aligned all the same, from the first step on, and little is made of that one.
-    after = starting.alignments(steps, 0.03, ahrs.AhrsParameters(), afresh=False).variance
+    after = starting.alignments(steps, 0.03, ahrs.AhrsParameters(), unknown=True).variance
     assert after[0] == pytest.approx(starting.MAX_TILT_SIGMA**2)
 
 
@@ -110,7 +131,7 @@ def test_the_heading_is_kept_without_a_horizontal_field(field):
     x = np.concatenate([np.roll(q.as_quat(), 1), np.zeros(3)])
     P = np.diag([0.01, 0.02, 0.03, 1e-4, 1e-4, 1e-4]) + 1e-4
     up = 9.0 * q.inv().apply([0.5, 0.1, 0.9])  # nearer to East than to North
-    starting.align(x, P, up, field * up, 0.04, ahrs.AhrsParameters(), afresh=True)
+    starting.align(x, P, up, field * up, 0.04, ahrs.AhrsParameters(), unknown=False)
     R = quaternion.to_matrix(x[:4])
     np.testing.assert_allclose(R[2], up / np.linalg.norm(up), atol=1e-12)
     # The horizontal axis that is kept: North, projected on the new horizon.

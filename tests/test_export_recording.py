@@ -26,8 +26,8 @@ SINGLE_SIGMA = 1e-3
 
 @functools.cache
 def case(name):
-    """A filter that has not started, and samples: time, gyro, accelerometer, magnetometer; None: missing."""
-    recording = with_missing(swinging(duration=12.0, shaken=10.0))
+    """A filter that has not started, and samples, with a gap: time, gyro, accelerometer, magnetometer; None: missing."""
+    recording = with_missing(swinging(duration=12.0, shaken=10.0)).taken(np.r_[:900, 980:1200])
     if name != "hand":
         parameters = of_motion("hand", magnetometer=True)
         if name == "white":

@@ -275,7 +275,7 @@ def _alignments(prepared: Prepared, added: Array, parameters: AhrsParameters) ->
     for first in [0, *(1 + np.flatnonzero(added.max(axis=1) > LARGE_TURN**2))]:
         rows = slice(first, int(np.searchsorted(time, time[first] + 2.0 * LAST_ALIGNMENT)))
         steps = alignment.Steps(*(column[rows] for column in prepared.steps))
-        aligned = alignments(steps, prepared.interval, parameters, afresh=first == 0)
+        aligned = alignments(steps, prepared.interval, parameters, unknown=first > 0)
         for k in np.flatnonzero(aligned.variance > 0.0):
             field = aligned.field[k]
             if first and prepared.field is not None and field.any():
@@ -286,7 +286,7 @@ def _alignments(prepared: Prepared, added: Array, parameters: AhrsParameters) ->
                 field=field,
                 tilt=float(aligned.variance[k]),
                 parameters=parameters,
-                afresh=first == 0,
+                unknown=first > 0,
             )
     return changes
 

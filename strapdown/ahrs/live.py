@@ -18,6 +18,7 @@ from strapdown.estimation import live as estimation_live
 from strapdown.estimation.forward import TooPreciseError
 from strapdown.estimation.live import change, restart
 from strapdown.kernels import live_imu as kernel
+from strapdown.kernels.alignment import UNKNOWN
 from strapdown.kernels.alignment import Outputs as Aligned
 from strapdown.kernels.alignment import Steps as Alignable
 from strapdown.kernels.argument_tables import packed
@@ -63,8 +64,8 @@ class LiveAhrs:
     sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
     the end of a recording ends a step of the filter. Samples before the first complete one are not used.
 
-    A gap of the samples is bridged by the mean of the rates at its ends. σ does not grow over it as in ``estimate``, which knows from the
-    whole recording how the rate changes. If the unit may have turned in a gap of some tenths of a second or more, start a new filter.
+    After a gap of more than half a second the attitude is treated as unknown, and is aligned again by the next samples. ``estimate`` knows
+    from the whole recording how much the rate changes over a gap.
 
     The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here.
 
@@ -174,7 +175,7 @@ class LiveAhrs:
             for name, (shape, kind, _) in (kernel.LASTING | kernel.PASSING).items()
         }
         arrays: Any = kernel.Arrays(**{name: np.zeros(shape, kind) for name, (shape, kind) in shapes.items()})
-        arrays.alignment[:] = starting.alignment_memory()
+        arrays.alignment[:] = starting.alignment_memory(unknown=False)
         arrays.force_density[0] = regions.FIRST_DENSITY[0]
         arrays.field_density[0] = regions.FIRST_DENSITY[0] if magnetometer else 1.0
         arrays.force_averages[:] = regions.first_memory(2, step)
@@ -289,7 +290,8 @@ class LiveAhrs:
             arrays = self._imu.arrays
             force, field, tilt = arrays.aligned_force[0], arrays.aligned_field[0], float(arrays.aligned_variance[0])
             mean = {"force": force, "field": field, "tilt": tilt, "parameters": self.parameters}
-            change(self._filter, functools.partial(starting.align, **mean, afresh=True))
+            unknown = arrays.alignment[UNKNOWN] > 0.0
+            change(self._filter, functools.partial(starting.align, **mean, unknown=unknown))
             arrays.aligned_variance[0] = 0.0
 
     def _begin(self) -> None:

@@ -169,33 +169,30 @@ def attitude_covariance(force: Array, tilt: float, heading: float) -> Array:
 
 
 def align(
-    x: Array, P: Array, force: Array, field: Array, tilt: float, parameters: AhrsParameters, *, afresh: bool
+    x: Array, P: Array, force: Array, field: Array, tilt: float, parameters: AhrsParameters, *, unknown: bool
 ) -> None:
     """Replace the attitude in a state x (n + 1,) and its covariance by that of mean specific force and field (3,), body axes.
 
-    ``tilt``: variance of the tilt, rad². ``afresh``: from the first sample on, where an attitude that agrees remains. After a gap the
-    heading remains without a field (zero), and if it is more certain than that of the field.
+    ``tilt``: variance of the tilt, rad². An attitude that agrees remains, unless the rotation before was ``unknown``; then the heading
+    remains if it is more certain than that of the field.
     """
-    constants, up = start_constants(parameters), force / np.linalg.norm(force)
-    if afresh and not alignment.departs(x[:4].tolist(), force.tolist(), tilt):
+    q, present = x[:4].tolist(), P[np.triu_indices(3)].tolist()
+    if not unknown and not alignment.departs(q, force.tolist(), tilt):
         return
-    if not afresh and field.any():
-        sine = alignment.sine_of_dip(force.tolist(), field.tolist())
-        if alignment.heading_variance(constants, sine, tilt) > up @ P[:3, :3] @ up:
-            field = np.zeros(3)
-    present = P[np.triu_indices(3)].tolist()
-    x[:4], heading = alignment.aligned(constants, force.tolist(), field.tolist(), tilt, x[:4].tolist(), present)
+    x[:4], heading = alignment.aligned(
+        start_constants(parameters), force.tolist(), field.tolist(), tilt, float(unknown), q, present
+    )
     P[:3], P[:, :3] = 0.0, 0.0
     P[:3, :3] = attitude_covariance(force, tilt, heading)
 
 
-def alignment_constants(interval: float, parameters: AhrsParameters, *, afresh: bool = True) -> alignment.Constants:
-    """Return the constants of the coarse alignment at this interval of the samples, s; ``afresh``: from the first sample on."""
+def alignment_constants(interval: float, parameters: AhrsParameters) -> alignment.Constants:
+    """Return the constants of the coarse alignment at this interval of the samples, s."""
     return alignment.Constants(
         interval=interval,
         first=FIRST_ALIGNMENT,
         last=LAST_ALIGNMENT,
-        min_motion=MIN_MOTION**2 if afresh else 0.0,
+        min_motion=MIN_MOTION**2,
         change_time=CHANGE_TIME,
         known=parameters.attitude_sigma**2,
         unknown=MAX_TILT_SIGMA**2,
@@ -203,20 +200,20 @@ def alignment_constants(interval: float, parameters: AhrsParameters, *, afresh: 
     )
 
 
-def alignment_memory(*, afresh: bool = True) -> Array:
-    """Return the memory of the coarse alignment before the first step; after a gap the first step already shows more than is known."""
+def alignment_memory(*, unknown: bool) -> Array:
+    """Return the memory before the first step; after an ``unknown`` rotation the first step already shows more than is known."""
     memory = np.zeros(alignment.SIZE)
-    memory[alignment.DUE] = FIRST_ALIGNMENT if afresh else 0.0
+    memory[alignment.UNKNOWN if unknown else alignment.DUE] = 1.0 if unknown else FIRST_ALIGNMENT
     return memory
 
 
 def alignments(
-    steps: alignment.Steps, interval: float, parameters: AhrsParameters, *, afresh: bool
+    steps: alignment.Steps, interval: float, parameters: AhrsParameters, *, unknown: bool
 ) -> alignment.Outputs:
-    """Return the coarse alignments over steps; ``interval``: that of the samples, s; ``afresh``: from the first sample on."""
+    """Return the coarse alignments over steps, at the start or after an ``unknown`` rotation; ``interval``: that of the samples, s."""
     k = len(steps.force)
     out = alignment.Outputs(np.zeros((k, 3)), np.zeros((k, 3)), np.empty(k))
-    constants, memory = alignment_constants(interval, parameters, afresh=afresh), alignment_memory(afresh=afresh)
+    constants, memory = alignment_constants(interval, parameters), alignment_memory(unknown=unknown)
     compiled(alignment.align_steps)(constants, alignment.Steps(*map(read_only, steps)), memory, out)
     return out
 

@@ -155,9 +155,9 @@ def init(f: Any) -> Any:
     for i in range(6):
         f.variance[i] = f.program.covariance[i][i]
     f.count[0] = f.count[1] = 0
-    for i, value in enumerate(starting.alignment_memory().tolist()):
+    for i, value in enumerate(starting.alignment_memory(unknown=False).tolist()):
         f.alignment[i] = value
-    f.aligned_variance[0] = 0.0
+    f.aligned_variance[0] = f.over_gap[0] = 0.0
     judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
     if r.imu.magnetometer:
         judged.append((f.field_density, f.field_averages, r.imu.arrays.field_averages))
@@ -257,10 +257,11 @@ def use_alignment(f: Any) -> None:
     """Replace the attitude by that of a coarse alignment: as strapdown.ahrs.starting.align."""
     n, tilt, q = f.program.n, f.aligned_variance[0], tuple(f.x[i] for i in range(4))
     force, field = (tuple(a[0, i] for i in range(3)) for a in (f.aligned_force, f.aligned_field))
-    if alignment.departs(q, force, tilt):
+    unknown = f.alignment[alignment.UNKNOWN]
+    if unknown > 0.0 or alignment.departs(q, force, tilt):
         covariance = tuple(f.P[body.place(n, i, j)] for i in range(3) for j in range(i, 3))
         constants = starting.start_constants(f.program.recording.parameters)
-        mean, heading = alignment.aligned(constants, force, field, tilt, q, covariance)
+        mean, heading = alignment.aligned(constants, force, field, tilt, unknown, q, covariance)
         put_attitude(f, mean, heading, force, tilt)
         for i in range(3):
             for j in range(3, n):
@@ -312,8 +313,19 @@ def carry_to_sample(imu: Any) -> None:
         f.variance[i] = carried.variance[1, i]
 
 
+def forget_attitude(imu: Any) -> None:
+    """Begin a coarse alignment after a rotation of which nothing is known, and add its variance to that of the attitude."""
+    f = imu.filter
+    for i, value in enumerate(starting.alignment_memory(unknown=True).tolist()):
+        f.alignment[i] = value
+    f.aligned_variance[0] = 0.0
+    for i in range(3):
+        f.P[body.place(f.program.n, i, i)] += f.over_gap[0]
+
+
 REPLACED: dict[str, Any] = {
-    function.__name__: function for function in (predict_filter, update_filter, show_filter, end_step, carry_to_sample)
+    function.__name__: function
+    for function in (predict_filter, update_filter, show_filter, forget_attitude, end_step, carry_to_sample)
 }
 
 

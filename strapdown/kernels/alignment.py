@@ -97,10 +97,10 @@ def iron_variance(sigma, sine):
 
 # ------------------------------------------------------------------------------------------------------------------- coarse alignment
 
-DUE, NUMBER, FORCE, SQUARE, FIELD_NUMBER, FIELD = 0, 1, 2, 5, 6, 7
+DUE, NUMBER, FORCE, SQUARE, FIELD_NUMBER, FIELD, UNKNOWN = 0, 1, 2, 5, 6, 7, 10
 """Places in the memory: duration at which the next alignment is due, s; number of the samples of the specific force, their sum, the sum of
-their squares; number of the samples of the field, their sum."""
-SIZE = 10
+their squares; number of the samples of the field, their sum; 1 after a rotation of which nothing is known."""
+SIZE = 11
 AGREES = 1.5
 """Difference of the filter's vertical from the mean, in σ of the mean, up to which the filter is left as it is."""
 
@@ -183,7 +183,7 @@ def align_step(constants, steps, memory, out, k):
     departure = square_root(square) / constants.gravity - 1.0
     spread = max(memory[SQUARE] / memory[NUMBER] - square, 0.0)
     motion = spread / (constants.gravity * constants.gravity) + departure * departure
-    if motion < constants.min_motion:
+    if motion < constants.min_motion and memory[UNKNOWN] == 0.0:
         return
     share = constants.change_time / duration
     out.variance[k] = min(constants.known + motion * share * share, constants.unknown)
@@ -201,11 +201,11 @@ def departs(q, force, tilt):
     return 2.0 - 2.0 * dot((R[6], R[7], R[8]), direction(force)) > AGREES * AGREES * tilt
 
 
-def aligned(constants, force, field, tilt, q, covariance):
+def aligned(constants, force, field, tilt, unknown, q, covariance):
     """Return the attitude by mean specific force and field, body axes, and the variance of its heading in addition to that by the tilt.
 
     Without a field (zero), or with one along the force, the heading of the attitude ``q`` is kept, with its variance in ``covariance`` (xx,
-    xy, xz, yy, yz, zz).
+    xy, xz, yy, yz, zz); after an ``unknown`` rotation also if it is more certain than that of the field.
     """
     up = direction(force)
     R = rotation_matrix(q)
@@ -215,5 +215,7 @@ def aligned(constants, force, field, tilt, q, covariance):
         across = north
     square, vertical = dot(field, field), dot(up, field)
     if square - vertical * vertical > MIN_HORIZONTAL * square:
-        across, heading = field, heading_variance(constants, sine_of_dip(force, field), tilt)
+        by_field = heading_variance(constants, sine_of_dip(force, field), tilt)
+        if unknown == 0.0 or by_field < heading:
+            across, heading = field, by_field
     return first_attitude(force, across), heading

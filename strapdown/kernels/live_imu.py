@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.alignment import SIZE, align_steps
+from strapdown.kernels.alignment import SIZE, UNKNOWN, align_steps
 from strapdown.kernels.argument_tables import call, unpacked
 from strapdown.kernels.headings import heading_steps
 from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
@@ -33,6 +33,11 @@ NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST, AHEAD = range(-26, -20)
 """Refusals."""
 MAX_INTERVAL = 3600.0
 """Maximum interval between samples, s, over which the filter predicts step by step: of a clock that jumps it would take for hours."""
+
+LONG_GAP = 0.5
+"""Interval between samples, s, after which the attitude is unknown; of units with fewer samples four times the usual one."""
+UNKNOWN_VARIANCE = 1.0
+"""Variance of an unknown rotation about each axis, rad²."""
 
 MOST = -1
 """In a shape: the most samples of a step."""
@@ -56,6 +61,7 @@ LASTING = {
         "",
         "of the coarse alignment: when it is due, s; numbers and sums of specific force and field",
     ),
+    "over_gap": ((1,), "", "variance of the rotation over the last interval, rad^2; 0: as certain as ever"),
     "aligned_force": ((1, 3), "", "mean specific force by which the attitude is aligned"),
     "aligned_field": ((1, 3), "", "mean field, zero without one"),
     "aligned_variance": ((1,), "", "variance of its tilt, rad^2; 0: it is not aligned"),
@@ -79,7 +85,7 @@ PASSING = {
     "middle": ((1, 4), "", "attitude by the gyro in the middle of the step"),
     "end": ((1, 4), "", "and at its end"),
     "now": ((1,), "wide", "time of its end, s"),
-    "turn_variance": ((1, 3), "", "0: the rotation over the step is as certain as ever"),
+    "turn_variance": ((1, 3), "", "variance of the rotation over the step in addition to the gyro's noise, rad^2"),
     "found_direction": ((1, 3), "", "heading measurement at the end of the step"),
     "found_sigma": ((1,), "", "its sigma; 0: none"),
     "found_usual": ((1, 2), "", "usual magnitude and dip of the field"),
@@ -231,9 +237,16 @@ def start(imu):
 
 def take_sample(imu):
     """Take a sample after the first one."""
+    a = imu.arrays
+    a.over_gap[0] = 0.0
+    if imu.time[0] - a.clock[0] > max(LONG_GAP, 4.0 * imu.interval):
+        a.over_gap[0] = UNKNOWN_VARIANCE
     ended = turn_with_gyro(imu)
     if ended:
         end_step(imu)
+        if a.over_gap[0] > 0.0:
+            forget_attitude(imu)
+            show_filter(imu)
     carry_to_sample(imu)
     look_for_rest(imu, ended)
 
@@ -294,7 +307,7 @@ def end_field(imu):
     a.length[0] = a.field_number[0] * imu.interval
     a.now[0] = a.clock[0]
     for i in range(3):
-        a.turn_variance[0, i] = 0.0
+        a.turn_variance[0, i] = a.over_gap[0]
     call(routines.head.address, routines.head.arguments, ())
     if a.found_sigma[0] > 0.0:
         update_filter(imu, 1, a.found_direction, a.found_sigma[0], a.field_innovation)
@@ -361,6 +374,16 @@ def update_filter(imu, sensor, vector, sigma, normalized):
     for i in range(normalized.shape[1]):
         value = live.innovation[0, 2 * i] / math.sqrt(live.innovation[0, 2 * i + 1])
         normalized[0, i] = value if abs(value) < math.inf else 0.0
+
+
+def forget_attitude(imu):
+    """Begin a coarse alignment after a rotation of which nothing is known, and add its variance to that of the attitude."""
+    alignment = imu.arrays.alignment
+    for i in range(SIZE):
+        alignment[i] = 1.0 if i == UNKNOWN else 0.0
+    imu.arrays.aligned_variance[0] = 0.0
+    for i in range(3):
+        imu.numbers[imu.places[i, i]] += imu.arrays.over_gap[0]
 
 
 def show_filter(imu):
