@@ -228,6 +228,7 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
 
     The record is run in parts. Before each uncertain rotation (:func:`uncertain_turns`) its variance is added to that of the attitude; the
     parts between are smoothed separately, because samples after an unknown rotation have little information about the attitude before it.
+    The filter is aligned coarsely at the start and after large ones (:func:`_alignments`); the smoother starts again from its own result.
     The filter's bias is corrected after each span at rest; the smoother's initial state includes all of them.
     """
     record, own, smooth = prepared.record, parameters.setup, options.smooth

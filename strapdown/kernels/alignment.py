@@ -101,6 +101,8 @@ DUE, NUMBER, FORCE, SQUARE, FIELD_NUMBER, FIELD, UNKNOWN = 0, 1, 2, 5, 6, 7, 10
 """Places in the memory: duration at which the next alignment is due, s; number of the samples of the specific force, their sum, the sum of
 their squares; number of the samples of the field, their sum; 1 after a rotation of which nothing is known."""
 SIZE = 11
+UNKNOWN_TURN = 1.0
+"""Variance of a rotation of which nothing is known, rad² about each axis."""
 AGREES = 1.5
 """Difference of the filter's vertical from the mean, in σ of the mean, up to which the filter is left as it is."""
 

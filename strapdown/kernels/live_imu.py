@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.alignment import SIZE, UNKNOWN, align_steps
+from strapdown.kernels.alignment import SIZE, UNKNOWN, UNKNOWN_TURN, align_steps
 from strapdown.kernels.argument_tables import call, unpacked
 from strapdown.kernels.headings import heading_steps
 from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
@@ -36,8 +36,6 @@ MAX_INTERVAL = 3600.0
 
 LONG_GAP = 0.5
 """Interval between samples, s, after which the attitude is unknown; of units with fewer samples four times the usual one."""
-UNKNOWN_VARIANCE = 1.0
-"""Variance of an unknown rotation about each axis, rad²."""
 
 MOST = -1
 """In a shape: the most samples of a step."""
@@ -240,7 +238,7 @@ def take_sample(imu):
     a = imu.arrays
     a.over_gap[0] = 0.0
     if imu.time[0] - a.clock[0] > max(LONG_GAP, 4.0 * imu.interval):
-        a.over_gap[0] = UNKNOWN_VARIANCE
+        a.over_gap[0] = UNKNOWN_TURN
     ended = turn_with_gyro(imu)
     if ended:
         end_step(imu)
@@ -289,10 +287,10 @@ def end_step(imu):
     if number > 0.0:
         update_filter(imu, 0, a.mean, imu.noise / math.sqrt(number * imu.interval), a.force_innovation)
         call(routines.judge.address, routines.judge.arguments, ())
-    if imu.magnetometer > 0:
-        end_field(imu)
     for i in range(4):
         a.end[0, i] = a.turned[i]
+    if imu.magnetometer > 0:
+        end_field(imu)
     call(routines.align.address, routines.align.arguments, ())
     begin_step(imu)
 
@@ -303,7 +301,7 @@ def end_field(imu):
     call(routines.average_field.address, routines.average_field.arguments, ())
     middle = (a.edge[1] + 1) // 2
     for i in range(4):
-        a.middle[0, i], a.end[0, i] = a.frame[middle, i], a.turned[i]
+        a.middle[0, i] = a.frame[middle, i]
     a.length[0] = a.field_number[0] * imu.interval
     a.now[0] = a.clock[0]
     for i in range(3):

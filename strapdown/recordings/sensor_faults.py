@@ -20,6 +20,7 @@ import numpy as np
 
 from strapdown.checks import Array, median
 from strapdown.kernels import recording_samples
+from strapdown.kernels.alignment import UNKNOWN_TURN
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import SENSORS, Recording, corrected
 from strapdown.units import DEGREE
@@ -52,8 +53,6 @@ MIN_STRAIGHT = 10
 """Minimum number of successive gyro samples on one straight line to be treated as interpolated."""
 STRAIGHT = 1e-4
 """Maximum second difference of such samples, relative to the median one of the recording."""
-UNKNOWN_TURN = 1.0
-"""Maximum variance of a rotation over a gap filled by interpolation, rad² per axis."""
 LEAD = 0.05
 """Time before such a gap whose samples are left out too, s, so that no step of the filter has some from before an unknown rotation."""
 LONG_INTERVAL = 1.5
