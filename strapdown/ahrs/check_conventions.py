@@ -28,7 +28,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
-from strapdown.checks import Array, Hint, InputError, lengths, median
+from strapdown.checks import Array, Hint, InputError, are_finite, lengths, median
 from strapdown.files import plain
 from strapdown.kernels import recording_steps
 from strapdown.kernels.lane_values import WIDTH
@@ -362,7 +362,7 @@ def _resting(recording: Recording) -> tuple[float, float, float | None] | None:
         quiet = quiet_span(recording)
     except InputError:  # too short
         return None
-    if force is None or not (known := np.isfinite(force[quiet]).all(axis=1)).any():
+    if force is None or not (known := are_finite(force[quiet])).any():
         return None
     samples = force[quiet][known]
     mean = samples.mean(axis=0)
@@ -379,7 +379,7 @@ def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
     if recording.magnetic_field is None:
         return None
     samples = recording.magnetic_field[quiet]
-    field = samples[np.isfinite(samples).all(axis=1)]
+    field = samples[are_finite(samples)]
     if len(field) == 0 or not np.any(mean := field.mean(axis=0)):
         return None
     return -math.asin(float(np.clip(mean @ up / np.linalg.norm(mean), -1.0, 1.0)))
@@ -491,7 +491,7 @@ def _sensor(vectors: Array, step: int) -> _Sensor:
     samples = vectors[::step]
     if np.isnan(samples).any():
         rows = np.arange(0, len(vectors), step)
-        known = np.append(np.flatnonzero(np.isfinite(vectors).all(axis=1)), len(vectors) + step)
+        known = np.append(np.flatnonzero(are_finite(vectors)), len(vectors) + step)
         later = known[np.searchsorted(known, rows)]
         samples = vectors[np.where(later < rows + step, later, rows)]
     size = lengths(samples)

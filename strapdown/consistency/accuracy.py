@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, InputError, are_finite, array
 from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
 from strapdown.consistency.manifold import nees
 from strapdown.files import plain
@@ -75,7 +75,7 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     """
     q = array("attitude", attitude, ("n", 4))
     r = array("reference", reference, (len(q), 4), allow_nan=True)
-    known = np.isfinite(r).all(axis=1)
+    known = are_finite(r)
     zero = known & (np.linalg.norm(r, axis=1) == 0.0)
     if zero.any():
         raise InputError(f"reference[{int(np.argmax(zero))}] is the zero quaternion; mark missing rows as NaN")
@@ -222,7 +222,7 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     if align:
         alignment, aligned = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
     if truth.has_bias and estimate.has_bias:
-        rows = np.isfinite(truth.bias).all(axis=1)
+        rows = are_finite(truth.bias)
         squares = (estimate.bias - truth.bias)[rows] ** 2, estimate.variance[rows, 3:]
         bias = tuple(float(np.sqrt(np.mean(np.sum(square, axis=1)))) for square in squares)
     return Accuracy(given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]

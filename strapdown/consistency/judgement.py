@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, unit_quaternions
+from strapdown.checks import Array, InputError, are_finite, unit_quaternions
 from strapdown.consistency.accuracy import accuracy
 from strapdown.consistency.bounds import log_mean_bounds, mean_bounds, mean_p_value, tail
 from strapdown.consistency.manifold import SUBSETS, errors, nees
@@ -410,7 +410,7 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: di
         )
     has_truth = ~np.isnan(truth.attitude).all(axis=1) & estimate.known
     if truth.has_bias:
-        has_truth &= np.isfinite(truth.bias).all(axis=1)
+        has_truth &= are_finite(truth.bias)
     if not has_truth.any():
         limits.append("the reference has no attitude at a time with an estimate")
         return []

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, is_definite, lengths
+from strapdown.checks import Array, InputError, are_finite, count, is_definite, lengths
 from strapdown.estimation import model as modelling
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates, spans, temperature_slopes
@@ -262,7 +262,7 @@ def filtered(problem: Problem, options: Options) -> Passed:
     passed = (_in_registers if fits_registers(problem, options) else _run)(problem, options)
     attitude = passed.estimate.attitude
     if not np.isfinite(attitude[-1]).all():  # NaN persists
-        end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
+        end = problem.record.time[options.every * int(np.argmin(are_finite(attitude)))]
         raise InputError(
             f"the filter diverged before {end:g} s: its attitude is not a number; the errors of the start or of the measurements are many "
             "times their sigmas"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.kernels import measurement
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import KIND_CODES
@@ -185,7 +185,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
     content = used.vector_b if used.attitude is None else used.attitude
     # One non-finite number makes the sum non-finite; a sum needs no memory.
     if not np.isfinite(content.sum()):
-        used = used.taken(np.isfinite(content).all(axis=1))
+        used = used.taken(are_finite(content))
     if used.attitude is not None:
         assert used.sigma_axes is not None
         frames = np.zeros((len(used.time), 9))

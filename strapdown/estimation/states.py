@@ -13,6 +13,7 @@ from strapdown import quaternion
 from strapdown.checks import (
     Array,
     InputError,
+    are_finite,
     array,
     by_axis,
     covariance,
@@ -283,7 +284,7 @@ def _attitude_of_set(
     body, fixed, sigmas, headings, used = [], [], [], [], []
     for series in record.vectors:
         content = series.vector_b if series.attitude is None else series.attitude
-        inside = (series.time >= record.time[0]) & (series.time <= record.time[-1]) & np.isfinite(content).all(axis=1)
+        inside = (series.time >= record.time[0]) & (series.time <= record.time[-1]) & are_finite(content)
         if np.sum(inside) > k:
             used.append(series.taken(np.flatnonzero(inside)[k : k + 1]))
 

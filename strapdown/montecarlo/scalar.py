@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import consistency, estimation
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
@@ -127,7 +127,7 @@ class Sums:
         rows = slice(None) if regular else _at_epochs(estimate.time, self.sums.time)
         edges = np.searchsorted(record.time, estimate.time[rows])
         P = estimate.covariance[rows]
-        known = np.isfinite(estimate.attitude[rows]).all(axis=1)
+        known = are_finite(estimate.attitude[rows])
         error = np.full((len(P), 6), np.nan)
         error[known] = consistency.errors(
             estimate.attitude[rows][known],
@@ -148,7 +148,7 @@ class Sums:
             P = np.nan_to_num(P)
         else:
             nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
-        good = np.isfinite(nees).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
+        good = are_finite(nees) & are_finite(error) & np.isfinite(P).all(axis=(1, 2))
         m, sums = np.flatnonzero(good), self.sums
         e, squares = error[m], nees[m]
         sums.finite[m] += 1

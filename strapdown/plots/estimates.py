@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, instance
+from strapdown.checks import Array, are_finite, instance
 from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
@@ -173,7 +173,7 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
 
     They are a rotation vector in the fixed frame, from estimate to reference; ``movement`` (n,) are the samples that are judged, shaded.
     """
-    known = np.asarray(np.isfinite(reference).all(axis=1))
+    known = are_finite(reference)
     error = np.full((len(known), 3), np.nan)
     error[known] = quaternion.log(quaternion.multiply(reference[known], quaternion.conjugate(estimate.attitude[known])))
     turn = quaternion.to_matrix(estimate.attitude)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, Hint, InputError, array
+from strapdown.checks import Array, Hint, InputError, are_finite, array
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, outputs, result_files
@@ -172,7 +172,7 @@ def _own(path: Path, kind: str) -> Attitudes:
             bias = reading.numbers(file, "bias") if "bias" in file else None
             innovations = result_files.innovations(file)
             attributes = reading.attributes(file)
-        known = np.isfinite(arrays["attitude"]).all(axis=1)
+        known = are_finite(arrays["attitude"])
         if not known.any():
             raise InputError(f"{path} is an estimate without a single attitude, because its filter failed; repeat it")
         time = arrays["time"][known]
@@ -200,7 +200,7 @@ def _of_recording(path: Path) -> Attitudes:
     recording = formats.read(path)
     if recording.true_attitude is None:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
-    known = np.isfinite(recording.true_attitude).all(axis=1)
+    known = are_finite(recording.true_attitude)
     movement = None if recording.movement is None else recording.movement[known]
     return Attitudes(
         source=recording.source,
@@ -242,7 +242,7 @@ def _table(path: Path) -> Attitudes:
         for name, group in places.items()
     }
     q = np.stack([columns["q"][axis] for axis in "wxyz"], axis=1)
-    rows = np.flatnonzero(np.isfinite(q).all(axis=1))  # the others are not read
+    rows = np.flatnonzero(are_finite(q))  # the others are not read
     columns = {name: {key: values[rows] for key, values in group.items()} for name, group in columns.items()}
     covariance, angles, remarks = _covariance(path.name, columns, rows)
     bias = None
@@ -425,7 +425,7 @@ def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], f
     for name, parts in fields.items():
         e = np.stack([np.asarray(values[part], np.float64)[rows] for part in parts], axis=1)
         s = np.stack([np.asarray(variances[part], np.float64)[other] for part in parts], axis=1)
-        new = np.isfinite(e).all(axis=1) & np.isfinite(s).all(axis=1) & (s > 0.0).all(axis=1)
+        new = are_finite(e) & are_finite(s) & (s > 0.0).all(axis=1)
         new &= np.concatenate([[True], np.any(np.diff(e, axis=0) != 0.0, axis=1)])
         if new.sum() > 1:
             time = (at[new].astype(np.int64) - first) / 1e6

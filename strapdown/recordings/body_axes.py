@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, InputError, are_finite, one_of
 from strapdown.records.recording import SENSORS, Recording
 
 
@@ -65,7 +65,7 @@ def with_axes(
 def _turned(source: str, attitude: Array, turn: Array) -> Array:
     if np.linalg.det(turn) < 0.0:
         raise InputError(f"{source}: axes mirror the unit, which its reference cannot be; give those of single sensors")
-    known = np.isfinite(attitude).all(axis=1)
+    known = are_finite(attitude)
     result = attitude.copy()
     result[known] = quaternion.multiply(attitude[known], quaternion.from_matrix(turn))
     return result

@@ -15,6 +15,7 @@ from strapdown import quaternion
 from strapdown.checks import (
     Array,
     InputError,
+    are_finite,
     array,
     increasing,
     instance,
@@ -349,7 +350,7 @@ class Estimate(ByValue, Listed):
         stamps = increasing("time", time)
         m = len(stamps)
         q = array("attitude", attitude, (m, 4), allow_nan=True)
-        known = np.isfinite(q).all(axis=1)
+        known = are_finite(q)
         unit_quaternions("attitude", q[known])
         P = matrices("covariance", covariance, m)
         if bias is not None and P.shape[1] == 3:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from strapdown import coning
-from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
+from strapdown.checks import Array, InputError, are_finite, array, increasing, instance, unit_quaternions
 from strapdown.results import ByValue, Listed, Table
 from strapdown.vectors import VectorMeasurements
 
@@ -52,7 +52,7 @@ class Truth(ByValue):
     @property
     def known(self) -> np.ndarray:
         """Whether each attitude is known (n + 1,)."""
-        return np.asarray(np.isfinite(self.attitude).all(axis=1))
+        return are_finite(self.attitude)
 
     @property
     def has_bias(self) -> bool:

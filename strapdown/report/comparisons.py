@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
 from strapdown.plots.style import AXES
@@ -106,7 +106,7 @@ def _differences(
 
 
 def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tuple[str, str]) -> list[str]:
-    known = np.isfinite(truth).all(axis=1)  # a reference may have gaps
+    known = are_finite(truth)  # a reference may have gaps
     series = []
     for j, (name, attitude) in enumerate(zip(names, attitudes, strict=True)):
         error = np.full(len(truth), np.nan)

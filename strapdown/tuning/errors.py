@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.consistency.alignment import turns
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.innovations import Likelihood, likelihood
@@ -106,7 +106,7 @@ def _reference(base: Likelihood, number: int) -> Reference:
     if case.judged is not None:
         judged &= case.judged[edges]
     if attitude is not None:
-        judged &= np.isfinite(attitude[edges]).all(axis=1)
+        judged &= are_finite(attitude[edges])
     if attitude is None or not judged.any():
         raise InputError(
             f"{case.name or 'record'} has no truth at the times to be judged; tune by the innovations instead (leave truth out), or give a "

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, non_negative, one_of
+from strapdown.checks import Array, InputError, are_finite, count, non_negative, one_of
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
@@ -262,7 +262,7 @@ def need_measurements(case: Case) -> None:
 def _usable(series: VectorMeasurements) -> np.ndarray:
     """Return which measurements of a series have a value (m,)."""
     content = series.vector_b if series.attitude is None else series.attitude
-    return np.asarray(np.isfinite(content).all(axis=1))
+    return are_finite(content)
 
 
 def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import ahrs, quaternion, records, units
 from strapdown.ahrs.remarks import fixed_frame, remarks, warn
-from strapdown.checks import Hint, InputError, array, count, instance
+from strapdown.checks import Hint, InputError, are_finite, array, count, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup, for_record
@@ -293,7 +293,7 @@ def _run_recording(
     if temperature is not None:
         source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
     reference, movement = source.true_attitude, source.movement
-    if reference is not None and movement is not None and not movement[np.isfinite(reference).all(axis=1)].any():
+    if reference is not None and movement is not None and not movement[are_finite(reference)].any():
         raise InputError(
             f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
         )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import coning, quaternion, recordings
-from strapdown.checks import Array, InputError, instance
+from strapdown.checks import Array, InputError, are_finite, instance
 from strapdown.recordings import Recording
 from strapdown.records import Estimate, ImuRecord, Origin
 from strapdown.workflows.estimating import SOURCE
@@ -87,7 +87,7 @@ def integrate(
 
 def _error_words(true: Array, attitude: Array) -> str:
     """Return a sentence on the errors of attitudes where the true ones (m, 4), of the first m of them, are known; empty if none is."""
-    rows = np.isfinite(true).all(axis=1)
+    rows = are_finite(true)
     if not rows.any():
         return ""
     error = np.degrees(quaternion.angle_between(quaternion.normalize(true[rows]), attitude[: len(true)][rows]))

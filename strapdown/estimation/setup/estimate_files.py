@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, count, finite, increasing, one_of, unit_quaternions
+from strapdown.checks import Array, InputError, are_finite, count, finite, increasing, one_of, unit_quaternions
 from strapdown.estimation.setup.files import from_toml, to_toml
 from strapdown.files import reading, set_attributes
 from strapdown.recordings.recordfiles import origin_attributes, origin_of
@@ -111,7 +111,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         time = increasing(reading.place(file, "time"), numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
-        known = np.asarray(np.isfinite(attitude).all(axis=1))
+        known = are_finite(attitude)
         variance, covariance = _variances(file, known)
         return Estimate(
             time=time,

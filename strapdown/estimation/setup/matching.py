@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import coning, gyro, quaternion, units, vectors
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.estimation.forward import strength
 from strapdown.estimation.setup.states import Entries, SensorStates, States
 from strapdown.gyro import GyroSpec, flicker
@@ -305,7 +305,7 @@ def _information(series: VectorMeasurements) -> float:
     if series.attitude is not None:
         assert series.sigma_axes is not None
         return float(np.sum(series.sigma_axes[series.sigma_axes > 0.0] ** -2.0)) / 3.0
-    known = np.isfinite(series.vector_b).all(axis=1) & (series.sigma > 0.0)
+    known = are_finite(series.vector_b) & (series.sigma > 0.0)
     length = np.linalg.norm(series.references_f, axis=1) if series.kind == "vector" else np.ones(len(series.time))
     share = 1.0 / 3.0 if series.kind == "heading" else 2.0 / 3.0
     return share * float(np.sum((length[known] / series.sigma[known]) ** 2))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import Array
+from strapdown.checks import Array, are_finite
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.tuning.diagnosis.causes import Cause
@@ -59,7 +59,7 @@ def run(model: Model) -> Run:
         innovations = estimate.innovations[series.sensor]
         content = series.vector_b if series.attitude is None else series.attitude
         used = (series.time >= model.record.time[0]) & (series.time <= model.record.time[-1])
-        used &= np.isfinite(content).all(axis=1)
+        used &= are_finite(content)
         rows = np.full((2, len(series.time), innovations.innovation.shape[1]), np.nan)
         rows[:, used] = innovations.whitened, np.log(innovations.variance)
         white.append(rows[0].ravel())
@@ -122,7 +122,7 @@ def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
             shifted = run(hypothesis.apply(model, theta + step * np.eye(k)[j]))
             columns.append((shifted.white - current.white) / step)
         J = np.stack(columns, axis=1)
-        common = np.isfinite(J).all(axis=1) & np.isfinite(current.white)
+        common = are_finite(J) & np.isfinite(current.white)
         J, z = J[common], current.white[common]
         information = J.T @ J + np.eye(k) * prior
         move = -np.linalg.solve(information, J.T @ z + prior * theta)
