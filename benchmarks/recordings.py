@@ -10,6 +10,9 @@ means over its recordings:
 - *rows*: share of the samples that have an attitude, of the recording with the least;
 - µs of processor time per sample.
 
+With ``--common-offset`` the heading offset is one of each set, the median of those of its recordings, so that the constant error of a
+heading counts, which the filter's σ includes: for sets with one reference frame.
+
 With ``--time`` only the time is measured: the least of several runs on each recording, the filters in turn, and relative to VQF.
 """
 
@@ -18,6 +21,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import math
 import sys
 import time
 import warnings
@@ -120,10 +124,15 @@ class Score:
     nees: float | None
     rows: float
     us: float
+    offset_deg: float | None = None
+    """Heading offset that was removed."""
 
 
-def score(recording: Recording, run: Filter) -> Score:
-    """Return the score of a filter on a recording, over the movement where reference and attitude are known."""
+def score(recording: Recording, run: Filter, offset: float | None = None) -> Score:
+    """Return the score of a filter on a recording, over the movement where reference and attitude are known.
+
+    ``offset``: of the heading, rad, to be removed; its own mean by default.
+    """
     begin = time.process_time()
     attitude, covariance = run(recording)
     us = 1e6 * (time.process_time() - begin) / len(recording.time)
@@ -137,17 +146,17 @@ def score(recording: Recording, run: Filter) -> Score:
         return Score(None, None, None, rows, us)
     q, reference = attitude[judged], recording.true_attitude[judged]
     d = quaternion.multiply(q, quaternion.conjugate(reference))
-    offset = np.angle(np.mean(np.exp(2j * np.arctan2(d[:, 3], d[:, 0]))))  # of the heading, constant
+    if offset is None:
+        offset = float(np.angle(np.mean(np.exp(2j * np.arctan2(d[:, 3], d[:, 0])))))
     P = np.full((len(q), 3, 3), np.nan) if covariance is None else covariance[judged]
     turned = quaternion.multiply(quaternion.exp([0.0, 0.0, -offset]), q)
     estimate = Estimate.from_arrays(recording.time[judged], turned, P)
     sizes = sd.accuracy(estimate, Truth(attitude=reference)).given["all samples"]
     error_deg = tuple(np.degrees([size.rms for size in sizes.values()]).tolist())
-    if covariance is None:
-        return Score(error_deg, None, None, rows, us)
-    return Score(
-        error_deg, tuple(size.coverage for size in sizes.values()), sizes["total"].rms_over_sigma ** 2, rows, us
-    )
+    own = (None, None)
+    if covariance is not None:
+        own = tuple(size.coverage for size in sizes.values()), sizes["total"].rms_over_sigma ** 2
+    return Score(error_deg, *own, rows, us, math.degrees(offset))
 
 
 def read(folder: Path) -> list[Recording]:
@@ -204,7 +213,23 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | None = None) -> dict[str, Any]:
+def scores_of(recordings: Sequence[Recording], run: Filter, *, common_offset: bool) -> list[Score]:
+    """Return the scores of a filter on the recordings of a set, with a heading offset of each or of all."""
+    own = [score(recording, run) for recording in recordings]
+    if not common_offset:
+        return own
+    unit = np.exp(1j * np.radians([each.offset_deg for each in own if each.offset_deg is not None]))
+    common = math.atan2(np.median(unit.imag), np.median(unit.real))
+    return [score(recording, run, common) for recording in recordings]
+
+
+def main(
+    folders: Sequence[Path],
+    names: Sequence[str],
+    known: dict[str, Any] | None = None,
+    *,
+    common_offset: bool = False,
+) -> dict[str, Any]:
     """Return the scores of filters on sets, added to those known, and print each as soon as it is known."""
     result: dict[str, Any] = {"metric": " ".join(__doc__.split("\n\n")[1].split()), "sets": {}, "filters": {}}
     result.update({key: dict(value) for key, value in (known or {}).items() if key in ("sets", "filters")})
@@ -212,7 +237,7 @@ def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | 
         recordings = read(folder)
         result["sets"][folder.name] = len(recordings)
         for name in names:
-            whole = mean([score(recording, FILTERS[name][1]) for recording in recordings])
+            whole = mean(scores_of(recordings, FILTERS[name][1], common_offset=common_offset))
             result["filters"].setdefault(name, {})[folder.name] = asdict(whole)
             words = [f"{folder.name} ({len(recordings)})".ljust(14), name.ljust(18)]
             for values in (whole.error_deg, whole.coverage):
@@ -227,6 +252,7 @@ if __name__ == "__main__":
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--filters", nargs="+", choices=FILTERS, default=list(FILTERS))
     parser.add_argument("--json", type=Path, help="file of the results; those of other sets and filters in it are kept")
+    parser.add_argument("--common-offset", action="store_true", help="remove one heading offset of each set")
     parser.add_argument("--time", action="store_true", help="measure only the time")
     arguments = parser.parse_args()
     installed = [name for name in arguments.filters if importlib.util.find_spec(FILTERS[name][0])]
@@ -235,7 +261,7 @@ if __name__ == "__main__":
         raise SystemExit
     print(f"{'set':14s} {'filter':18s} {'error, deg':>18s} {'coverage':>18s} NEES  rows     µs")
     held = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else None
-    scores = main(arguments.folders, installed, held)
+    scores = main(arguments.folders, installed, held, common_offset=arguments.common_offset)
     print(table(scores))
     if arguments.json:
         write_json(arguments.json, scores)
