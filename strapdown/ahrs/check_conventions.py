@@ -466,7 +466,7 @@ def _score(misfit: Array, floor: float) -> Array:
 
 SPAN = 4.0
 """Duration of the windows over which vectors are averaged, s: accelerations average out, and the gyro's bias causes a small rotation."""
-MIN_INTERVAL = 0.04
+MIN_INTERVAL = 0.1
 """Minimum interval of the samples of a vector used, s."""
 
 
