@@ -342,8 +342,10 @@ def test_a_very_long_chart_keeps_its_extremes(monkeypatch):
     assert when[drawn.argmax()] == pytest.approx(time[3001], abs=1e-6)
 
 
-def test_a_chart_of_an_angle_breaks_where_it_wraps():
-    time = np.linspace(0.0, 10.0, 5001)
+@pytest.mark.parametrize("samples", [5001, 50_001])
+def test_a_chart_of_an_angle_breaks_where_it_wraps(samples, monkeypatch):
+    monkeypatch.setattr(page, "CHART_SAMPLES", 10_000)  # the longer chart is reduced to the extremes of each column
+    time = np.linspace(0.0, 10.0, samples)
     angle = np.mod(90.0 * time + 180.0, 360.0) - 180.0
     (chart,) = charts_of(page.chart("t", "°", time, (page.Series(label="yaw", value=angle, wraps=True),)))
     data = columns(chart)[1]

@@ -164,7 +164,7 @@ def chart(
     values = [line.value[rows] for line in series]
     for k, line in enumerate(series):
         if line.wraps:
-            values[k] = np.where(np.isin(rows, wraps(line.value, rows)), np.nan, values[k])
+            values[k][wraps(line.value, rows)] = np.nan
     content = {
         "title": title,
         "unit": unit,
