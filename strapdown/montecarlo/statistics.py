@@ -336,6 +336,11 @@ class Statistics(ByValue, Listed):
         """
         return consistency.mean_bounds(1, int(self.sensor_degrees.sum()), probability)
 
+    @property
+    def nis_interval_bounds(self) -> tuple[float, float]:
+        """99 % bounds of :attr:`nis` of a consistent filter in a time bin with the median number of degrees of freedom."""
+        return consistency.mean_bounds(1, round(float(np.median(self.nis_degrees[self.nis_degrees > 0]) * self.runs)))
+
     def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
         """Return the two-sided χ² test of the ANEES at given epochs.
 

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown.checks import one_of
-from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.plots import style
@@ -78,9 +77,7 @@ def nis_over_time(
     for k, (name, statistics) in enumerate(named):
         measured = statistics.nis_degrees > 0
         ax.plot(statistics.nis_time[measured], statistics.nis[measured], label=name, **style.layered(k, len(named)))
-    first = named[0][1]
-    typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
-    ax.axhspan(*mean_bounds(1, typical), color=style.ink(), alpha=0.12, linewidth=0, label=label)
+    ax.axhspan(*named[0][1].nis_interval_bounds, color=style.ink(), alpha=0.12, linewidth=0, label=label)
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
     return ax

@@ -75,17 +75,16 @@ def _unit(state: int, value: Array) -> tuple[str, float]:
 
 def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:
     """Return charts of ANEES and NIS with their bounds, and of the quantiles of the errors with those that the filter predicts."""
-    charts = []
-    for finding in judgement.findings:
-        if finding.name == "ANEES" and finding.of in ("attitude", "bias"):
-            lines = (page.Series(label="ANEES, all runs", value=statistics.anees[:, SUBSETS[finding.of][0]]),)
-            charts.append(_bounded(f"ANEES of the {finding.of}", statistics.time, lines, (finding.low, finding.high)))
-    known = statistics.nis_degrees > 0
-    if known.any():
-        samples = round(float(np.median(statistics.nis_degrees[known]) * statistics.runs))
-        lines = (page.Series(label="NIS, all runs", value=np.where(known, statistics.nis, np.nan), colour="--b"),)
-        bounds = consistency.mean_bounds(1, samples)
-        charts.append(_bounded("NIS in each interval", statistics.nis_time, lines, bounds))
+    charts = [
+        _bounded(
+            f"ANEES of the {of}", statistics.time, statistics.anees[:, SUBSETS[of][0]], (finding.low, finding.high)
+        )
+        for finding in judgement.findings
+        if finding.name == "ANEES" and (of := finding.of) in ("attitude", "bias")
+    ]
+    if statistics.sensor_degrees.any():
+        bounds = statistics.nis_interval_bounds
+        charts.append(_bounded("NIS in each interval", statistics.nis_time, statistics.nis, bounds))
     settled = slice(len(statistics.time) // 20, None)
     for k, name in enumerate(_estimated(statistics)):
         sigma = statistics.sigma[:, k]
@@ -98,17 +97,16 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
             predicted.append(page.Series(label=f"{words} by the filter", value=value, colour=colour, dash=True))
         title = f"|{name} error|: quantiles of the runs, and those predicted by the filter"
         courses = [*quantiles, *predicted]
-        least, largest = (each([each(line.value) for line in courses]) for each in (np.min, np.max))
+        least, largest = (each([line.value for line in courses]) for each in (np.min, np.max))
         log = bool(20.0 * least < largest < 1000.0 * least)  # beyond, the 16 bits of the chart would show as steps
         charts.append(page.chart(title, f"|{name} error|, {unit}", statistics.time, courses, log=log))
     return charts
 
 
-def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
+def _bounded(title: str, time: Array, value: Array, bounds: tuple[float, float]) -> str:
     """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
-    band = page.band(np.full(len(time), bounds[0]), np.full(len(time), bounds[1]))
-    log = bool(max(np.nanmax(line.value) for line in lines) > 4.0)
-    return page.chart(title, "per degree of freedom", time, (*band, *lines), log=log)
+    series = page.band(*bounds) + page.lines([f"{title.split(maxsplit=1)[0]}, all runs"], [value])
+    return page.chart(title, "per degree of freedom", time, series, log=bool(np.nanmax(value) > 4.0))
 
 
 def _end(statistics: Statistics) -> list[str]:
@@ -119,9 +117,7 @@ def _end(statistics: Statistics) -> list[str]:
     places, shares = np.arange(float(len(names))), []
     for k, expected in enumerate(COVERED):
         low, high = 100.0 * binom.ppf([0.005, 0.995], runs, expected) / runs
-        shares += page.band(
-            np.full(len(names), low), np.full(len(names), high), (f"99 % bounds, {k + 1}σ", "lower bound")
-        )
+        shares += page.band(low, high, (f"99 % bounds, {k + 1}σ", "lower bound"))
         words = f"within {k + 1}σ, expected {100.0 * expected:.1f} %"
         covered = 100.0 * statistics.covered[-1, : len(names), k]
         shares.append(page.Series(label=words, value=covered, colour=page.COLOURS[k]))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,14 +73,17 @@ def _at(estimate: Estimate, time: Array) -> tuple[Array, Array, Array]:
 
 
 def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str], fixed_frame: str) -> list[str]:
-    charts = []
-    for label, *pair in zip(angle_labels(fixed_frame), *(roll_pitch_yaw(q).T for q in attitudes), strict=True):
-        series = [
-            page.Series(label=name, value=angle, colour=page.COLOURS[j], wraps=True, dash=j == 1)
-            for j, (name, angle) in enumerate(zip(names, pair, strict=True))
-        ]
-        charts.append(page.chart(label, "angle, °", time, series))
-    return charts
+    angles = zip(*(roll_pitch_yaw(q).T for q in attitudes), strict=True)
+    return [
+        page.chart(label, "angle, °", time, _both(names, pair, wraps=True))
+        for label, pair in zip(angle_labels(fixed_frame), angles, strict=True)
+    ]
+
+
+def _both(names: Sequence[str], values: Iterable[Array], **look: Any) -> list[page.Series]:
+    """Return a line of each estimate, the second dashed, as it may cover the first."""
+    first, second = page.lines(names, values, **look)
+    return [first, dataclasses.replace(second, dash=True)]
 
 
 def _differences(
@@ -107,12 +111,10 @@ def _differences(
 
 def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tuple[str, str]) -> list[str]:
     known = are_finite(truth)  # a reference may have gaps
-    series = []
-    for j, (name, attitude) in enumerate(zip(names, attitudes, strict=True)):
-        error = np.full(len(truth), np.nan)
+    errors = np.full((2, len(truth)), np.nan)
+    for error, attitude in zip(errors, attitudes, strict=True):
         error[known] = quaternion.angle_between(attitude[known], truth[known]) / DEGREE
-        series.append(page.Series(label=name, value=error, colour=page.COLOURS[j], dash=j == 1))
-    return [page.chart("Total attitude error relative to the truth", "error, °", time, series)]
+    return [page.chart("Total attitude error relative to the truth", "error, °", time, _both(names, errors))]
 
 
 def _numbers(difference: Array, angle: Array, sigmas: tuple[Array, Array], names: tuple[str, str]) -> str:

@@ -93,21 +93,15 @@ def _error_charts(estimate: Estimate, error: Array) -> list[str]:
 def _estimate_charts(estimate: Estimate) -> list[str]:
     """Return charts of the Euler angles, the bias, and the σ of the attitude, as far as the estimate has them."""
     time, sigma = estimate.time, estimate.sigma
-    euler = roll_pitch_yaw(estimate.attitude)
-    series = [
-        page.Series(label=name, value=euler[:, k], colour=page.COLOURS[k], wraps=True)
-        for k, name in enumerate(angle_labels(estimate.fixed_frame))
-    ]
-    charts = [page.chart("Attitude, Euler angles Z-Y-X", "angle, °", time, series)]
+    angles = page.lines(angle_labels(estimate.fixed_frame), roll_pitch_yaw(estimate.attitude).T, wraps=True)
+    charts = [page.chart("Attitude, Euler angles Z-Y-X", "angle, °", time, angles)]
     if estimate.has_bias:
         unit, size = rate_unit(3.0 * sigma[len(time) // 20 :, 3:])
-        values = zip(AXES, estimate.bias.T / size, page.COLOURS, strict=True)
-        series = [page.Series(label=axis, value=bias, colour=colour) for axis, bias, colour in values]
-        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", time, series))
+        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", time, page.lines(AXES, estimate.bias.T / size)))
     if estimate.has_covariance:
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
-        series = [page.Series(label="σ, root sum square of the three axes", value=spread)]
-        charts.append(page.chart("Attitude σ", "attitude σ, °", time, series))
+        line = page.lines(["σ, root sum square of the three axes"], [spread])
+        charts.append(page.chart("Attitude σ", "attitude σ, °", time, line))
     return charts
 
 
@@ -129,20 +123,15 @@ def _sensor(name: str, innovations: Innovations) -> str:
     correlation = consistency.autocorrelation(white)
     bounds = correlation.simultaneous_bounds
     lags = page.band(-bounds, bounds, ("99 % bounds, all lags", "lower bound"))
-    lags += [
-        page.Series(
-            label=AXES[k] if correlation.values.shape[1] > 1 else "innovations", value=value, colour=page.COLOURS[k]
-        )
-        for k, value in enumerate(correlation.values.T)
-    ]
+    lags += page.lines(AXES if correlation.values.shape[1] > 1 else ["innovations"], correlation.values.T)
     nis, (low, high) = innovations.nis / white.shape[1], consistency.mean_bounds(white.shape[1], 1)
-    course = page.band(np.full(number, low), np.full(number, high), ("99 % bounds, each", "lower bound"))
-    course.append(page.Series(label="one measurement", value=np.maximum(nis, 1e-4)))
+    curves = [np.maximum(nis, 1e-4)]
     if number >= 2 * WINDOW:
-        mean = np.full(number, np.nan)
-        first = WINDOW // 2
+        mean, first = np.full(number, np.nan), WINDOW // 2
         mean[first : first + number - WINDOW + 1] = np.convolve(nis, np.full(WINDOW, 1.0 / WINDOW), mode="valid")
-        course.append(page.Series(label=f"mean of {WINDOW}", value=mean, colour="--b"))
+        curves.append(mean)
+    course = page.band(low, high, ("99 % bounds, each", "lower bound"))
+    course += page.lines(["one measurement", f"mean of {WINDOW}"], curves)
     return page.section(
         title,
         page.chart("Innovations over their σ", "density", at, shape, x="innovation over its σ"),

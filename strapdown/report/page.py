@@ -8,7 +8,7 @@ import importlib.resources
 import json
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ CHART_SAMPLES = 200_000
 
 
 COLOURS = ("--a", "--b", "--c")
-"""Colours of the lines of three axes or of several results, by their names in page.css."""
+"""Colours of up to three lines, by their names in page.css."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +39,7 @@ class Series:
 
     label: str
     value: Array
-    """Values (n,), in the unit of the chart."""
+    """Values (n,), in the unit of the chart; a limit of a filled band may be one number."""
     colour: str = "--a"
     """Colour, by its name in page.css."""
     band: bool = False
@@ -50,12 +50,16 @@ class Series:
     """Whether the line is dashed."""
 
 
-def band(
-    low: Array, high: Array, labels: tuple[str, str] = ("upper bound", "lower bound"), **look: Any
-) -> list[Series]:
+def band(low: Any, high: Any, labels: tuple[str, str] = ("upper bound", "lower bound"), **look: Any) -> list[Series]:
     """Return the series of a band, by default filled, from its limits; ``labels`` are those of the upper and the lower one."""
     look = look or {"colour": "--faint", "band": True}
     return [Series(label=label, value=value, **look) for label, value in zip(labels, (high, low), strict=True)]
+
+
+def lines(labels: Sequence[str], values: Iterable[Array], **look: Any) -> list[Series]:
+    """Return the series of up to three axes or results, each in its colour."""
+    named = zip(labels, values, COLOURS, strict=False)
+    return [Series(label=label, value=value, colour=colour, **look) for label, value, colour in named]
 
 
 def text(content: Any) -> str:
@@ -156,15 +160,15 @@ def chart(
     ``unit`` and ``x`` are the labels of the axes. The vertical axis is ±``reach`` at first; None: the range of the data. ``ticks`` are the
     names of 0, 1, … on the horizontal axis, if it has no numbers; lines are then drawn as points.
     """
-    lines = [line.value for line in series if not line.band]
     rows = np.arange(len(time))
     if len(rows) > CHART_SAMPLES:  # a page of some ten megabytes
-        columns = CHART_SAMPLES // (2 * len(lines))
-        rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in lines]))
-    values = [line.value[rows] for line in series]
-    for k, line in enumerate(series):
+        drawn = [line.value for line in series if not line.band]
+        columns = CHART_SAMPLES // (2 * len(drawn))
+        rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in drawn]))
+    values = [np.broadcast_to(line.value, time.shape)[rows] for line in series]
+    for value, line in zip(values, series, strict=True):
         if line.wraps:
-            values[k][wraps(line.value, rows)] = np.nan
+            value[wraps(line.value, rows)] = np.nan
     content = {
         "title": title,
         "unit": unit,
