@@ -201,6 +201,31 @@ def test_errors_are_drawn_in_the_unit_of_their_label(run):
         assert top == pytest.approx(3.0 * estimate.sigma[:, state].max() / size, rel=0.02)  # or no lighter part
 
 
+def test_errors_are_drawn_where_estimate_and_truth_are_known(run):
+    """A truth with a gap and a filter of another program that begins late and has neither bias nor σ."""
+    estimate, truth = (part.taken(slice(3000)) for part in run)  # few enough for a line of all samples
+    gap, late = truth.attitude.copy(), estimate.attitude.copy()
+    gap[20:60], late[:9] = np.nan, np.nan
+    truth, nothing = dataclasses.replace(truth, attitude=gap), np.full_like(estimate.variance, np.nan)
+    other = dataclasses.replace(
+        estimate, attitude=late, bias=np.full_like(estimate.bias, np.nan), variance=nothing, covariance=None
+    )
+    for compared, number, unknown in (
+        (estimate, 6, 40),
+        (other, 3, 49),
+        (dataclasses.replace(other, bias=estimate.bias), 6, 49),
+    ):
+        axes = plots.error_overview(compared, truth).axes
+        assert len(axes) == number
+        for ax in axes:
+            assert np.isnan(ax.lines[-1].get_ydata()).sum() == unknown
+            assert ax.get_ylim()[1] >= np.nanmax(np.abs(ax.lines[-1].get_ydata()[len(late) // 20 :]))
+    with pytest.raises(InputError, match=f"truth has {len(gap) - 1} times, the estimate {len(gap)}"):
+        plots.error_overview(estimate, truth.taken(slice(1, None)))
+    with pytest.raises(InputError, match="truth has no attitude at a time of the estimate"):
+        plots.error_overview(estimate, dataclasses.replace(truth, attitude=np.full_like(gap, np.nan)))
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_budget_that_starts_without_error_shows_what_comes_after():
     opposite = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, are_finite, instance
+from strapdown.checks import Array, InputError, are_finite, instance
 from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
@@ -99,17 +99,15 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 
 def _bias(ax: Axes, estimate: Estimate) -> None:
     """Draw the gyro bias with its ±3σ over time."""
-    sigma = estimate.sigma[:, 3:]
-    settled = slice(len(estimate.time) // 20, None)
-    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled].max()
-    unit, size = rate_unit(3.0 * sigma[settled])
-    for k, name in enumerate(style.AXES):
-        bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, k] / size
-        bounds = envelope(estimate.time, bias - spread, bias + spread)
-        ax.fill_between(*bounds, color=style.CYCLE[k], alpha=0.18, linewidth=0)
+    unit, size = rate_unit(style.settled(3.0 * estimate.sigma[:, 3:]))
+    values, spread = estimate.bias / size, 3.0 * estimate.sigma[:, 3:] / size
+    for name, color, bias, three_sigma in zip(style.AXES, style.CYCLE, values.T, spread.T, strict=False):
+        bounds = envelope(estimate.time, bias - three_sigma, bias + three_sigma)
+        ax.fill_between(*bounds, color=color, alpha=0.18, linewidth=0)
         label = f"{name}, band {THREE_SIGMA}"
-        ax.plot(*decimated(estimate.time, bias), color=style.CYCLE[k], linewidth=1.0, label=label)
-    ax.set_ylim(-1.2 * reach / size, 1.2 * reach / size)
+        ax.plot(*decimated(estimate.time, bias), color=color, linewidth=1.0, label=label)
+    reach = style.reach(values, np.abs(values) + spread)
+    ax.set_ylim(-reach, reach)
     ax.set_ylabel(f"gyro bias, {unit}")
     style.legend_above(ax)
 
@@ -117,7 +115,7 @@ def _bias(ax: Axes, estimate: Estimate) -> None:
 def _attitude_sigma(ax: Axes, estimate: Estimate) -> None:
     """Draw the σ of the attitude over time."""
     total = np.linalg.norm(estimate.sigma[:, :3], axis=1)
-    settled = total[len(total) // 20 :]
+    settled = style.settled(total)
     unit, size = angle_unit(settled)
     words = "root sum square of the three axes"
     # A line that follows the changes of σ between measurements would be a black area.
@@ -144,7 +142,6 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     ]
     figure, grid = style.new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
     axes = np.atleast_1d(grid)
-    settled = slice(len(estimate.time) // 10, None)
     for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
         word, size = estimate.state_unit(name, unit)
         values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
@@ -157,7 +154,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
                 for edge in (low, high):
                     ax.plot(edges, edge, ":", color=color, linewidth=0.9)
             ax.plot(*decimated(estimate.time, values[:, k]), color=color, linewidth=0.9, label=block.components[member])
-        reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
+        reach = style.reach(np.abs(values) + spread)
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(word)
         ax.set_title(error_state_name(name, "", unit), loc="left")
@@ -189,9 +186,8 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
             words = "movement (judged)" if k == 0 else None
             ax.axvspan(*estimate.time[[first, last - 1]], color=style.ink(), alpha=0.07, linewidth=0, label=words)
         errors_in_envelope(estimate.time, error[None, :, axis] / DEGREE, sigma[:, axis] / DEGREE, ax)
-        settled = slice(len(known) // 20, None)
-        largest = np.nanmax(np.abs(error[settled, axis]), initial=0.0)
-        reach = max(1.2 * largest, min(3.6 * np.median(sigma[settled, axis]), 6.0 * largest)) / DEGREE
+        largest = style.reach(error[:, axis])
+        reach = max(largest, min(3.6 * np.median(style.settled(sigma[:, axis])), 5.0 * largest)) / DEGREE
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(f"{name}, °")
         if ax is not axes[-1]:
@@ -199,6 +195,39 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
     figure.suptitle("Error relative to the reference, axes of the fixed frame")
     style.legend_below(figure, axes, ncols=4)
     return figure
+
+
+class StateError(NamedTuple):
+    """The error of one state over time with the filter's σ, in the unit that both are read best in."""
+
+    what: str
+    """attitude or bias"""
+    axis: str
+    unit: str
+    error: Array
+    """(n,); NaN where estimate or truth is unknown."""
+    sigma: Array
+    """(n,); NaN without a covariance."""
+
+
+def state_errors(estimate: Estimate, truth: Truth) -> list[StateError]:
+    """Return the errors of the attitude (rotation vector in body axes) and of the gyro bias, if they are known, relative to a truth."""
+    if len(truth.attitude) != len(estimate.time):
+        raise InputError(
+            f"truth has {len(truth.attitude)} times, the estimate {len(estimate.time)}; give both at the same times"
+        )
+    known = estimate.known & truth.known
+    error = np.full((len(known), 6), np.nan)
+    error[known] = errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known])
+    states = []
+    for what, first, unit_of in (("attitude", 0, angle_unit), ("bias", 3, rate_unit)):
+        part = slice(first, first + 3)
+        if np.isfinite(error[:, part]).any():
+            spread = 3.0 * estimate.sigma[:, part]
+            unit, size = unit_of(style.settled(spread if np.isfinite(spread).any() else error[:, part]))
+            sized = zip(style.AXES, error[:, part].T / size, estimate.sigma[:, part].T / size, strict=True)
+            states += [StateError(what, axis, unit, *values) for axis, *values in sized]
+    return states
 
 
 def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figure:
@@ -219,23 +248,18 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
         Attitude errors as a rotation vector in body axes, ``q_true = q_est ⊗ exp(δθ)``.
     """
     instance("truth", truth, Truth, "give that of the record, record.truth")
-    figure, axes = style.new_figure(3, 2, size=(10.0, 6.6), sharex=True)
-    error = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    settled = slice(len(estimate.time) // 20, None)
-    for column, (what, unit_of) in enumerate((("attitude", angle_unit), ("bias", rate_unit))):
-        states = slice(3 * column, 3 * column + 3)
-        unit, size = unit_of(3.0 * estimate.sigma[settled, states])
-        for k in range(3):
-            state = 3 * column + k
-            ax = axes[k, column]
-            errors_in_envelope(estimate.time, error[None, :, state] / size, estimate.sigma[:, state] / size, ax)
-            reach = max(4.0 * estimate.sigma[settled, state].max(), 1.2 * np.abs(error[settled, state]).max()) / size
-            ax.set_ylim(-reach, reach)
-            ax.set_ylabel(f"{what} {style.AXES[k]}, {unit}")
-            if k < 2:
-                ax.set_xlabel("")
-    axes[0, 0].set_title("Attitude error, rotation vector in body axes")
-    axes[0, 1].set_title("Gyro bias error, body axes")
+    drawn = state_errors(estimate, truth)
+    if not drawn:
+        raise InputError("truth has no attitude at a time of the estimate; give one that is known there")
+    columns = len(drawn) // 3
+    figure, axes = style.new_figure(3, columns, size=(5.0 * columns, 6.6), sharex=True, squeeze=False)
+    for ax, (what, axis, unit, error, sigma) in zip(axes.T.flat, drawn, strict=True):
+        errors_in_envelope(estimate.time, error[None], sigma, ax)
+        reach = style.reach(error, 3.0 * sigma)
+        ax.set(ylim=(-reach, reach), ylabel=f"{what} {axis}, {unit}", xlabel="time, s" if axis == "z" else "")
+    titles = ("Attitude error, rotation vector in body axes", "Gyro bias error, body axes")
+    for ax, words in zip(axes[0], titles, strict=False):
+        ax.set_title(words)
     style.legend_below(figure, [axes[0, 0]])
     figure.suptitle(f"{title}{': e' if title else 'E'}rrors against the truth")
     return figure

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import AutoLocator, LogFormatterSciNotation, LogLocator, NullLocator
 
-from strapdown.checks import one_of
+from strapdown.checks import Array, one_of
 from strapdown.files import atomic_write
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -154,6 +154,16 @@ def legend_below(figure: Figure, axes: Sequence[Axes], *, ncols: int = 4) -> Non
     """Put one legend for several axes, each label once, below a figure."""
     handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=ncols, frameon=False)
+
+
+def settled(values: Array) -> Array:
+    """Return the values (n, …) over time from the first twentieth on, within which a filter converges: they decide on units and scales."""
+    return values[len(values) // 20 :]
+
+
+def reach(*curves: Array) -> float:
+    """Return the limit ± of an axis that shows the settled part of curves (n, …)."""
+    return 1.3 * max(float(np.nanmax(np.abs(settled(curve)), initial=0.0)) for curve in curves)
 
 
 ALIKE = 2.0

@@ -16,6 +16,7 @@ from strapdown.consistency.judgement import state_name
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
+from strapdown.plots.style import settled
 from strapdown.report import page
 from strapdown.results import Table
 from strapdown.units import angle_unit, rate_unit
@@ -85,10 +86,9 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list
     if statistics.sensor_degrees.any():
         bounds = statistics.nis_interval_bounds
         charts.append(_bounded("NIS in each interval", statistics.nis_time, statistics.nis, bounds))
-    settled = slice(len(statistics.time) // 20, None)
     for k, name in enumerate(_estimated(statistics)):
         sigma = statistics.sigma[:, k]
-        unit, size = _unit(k, 3.0 * statistics.sigma[settled, k // 3 * 3 : k // 3 * 3 + 3])
+        unit, size = _unit(k, settled(3.0 * statistics.sigma[:, k // 3 * 3 : k // 3 * 3 + 3]))
         quantiles, predicted = [], []
         for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c")):
             words, value = f"{100 * share:g} %", statistics.error_quantile(share)[:, k] / size

@@ -13,7 +13,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, are_finite
 from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
-from strapdown.plots.style import AXES
+from strapdown.plots.style import AXES, reach, settled
 from strapdown.records import Estimate
 from strapdown.records.recording import interpolated
 from strapdown.report import page
@@ -95,17 +95,15 @@ def _differences(
     unit_of: Callable[[Array], tuple[str, float]],
 ) -> list[str]:
     """Return a chart of each axis of a difference, with ±3σ of the first estimate as a band and of the second as lines."""
-    settled = slice(len(time) // 20, None)
-    unit, size = unit_of(3.0 * np.maximum(*sigmas)[settled])
+    unit, size = unit_of(settled(3.0 * np.maximum(*sigmas)))
     charts = []
     for k, axis in enumerate(AXES):
         first, second = (3.0 * sigma[:, k] / size for sigma in sigmas)
         series = page.band(-first, first, (f"+3σ of {names[0]}", "−3σ"))
         series += page.band(-second, second, (f"+3σ of {names[1]}", "−3σ "), colour="--b", dash=True)
         series.append(page.Series(label="difference, second minus first", value=difference[:, k] / size))
-        reach = 1.3 * max(float(np.abs(curve[settled]).max()) for curve in (first, second, difference[:, k] / size))
         title, label = f"{what} {axis}, difference", f"{what.lower()} {axis}, {unit}"
-        charts.append(page.chart(title, label, time, series, reach=reach))
+        charts.append(page.chart(title, label, time, series, reach=reach(*(line.value for line in series))))
     return charts
 
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from strapdown import consistency, quaternion, records, workflows
-from strapdown.checks import Array
 from strapdown.estimation import setup
-from strapdown.plots.estimates import angle_labels, roll_pitch_yaw
-from strapdown.plots.style import AXES
+from strapdown.plots import style
+from strapdown.plots.estimates import StateError, angle_labels, roll_pitch_yaw, state_errors
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import page
-from strapdown.units import DEGREE, angle_unit, rate_unit
+from strapdown.units import DEGREE, rate_unit
 
 REACH = 5.0
 """Range of the distribution of whitened innovations, ±σ; those beyond it are in the outermost bins."""
@@ -30,15 +29,9 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     judgement = workflows.check(estimate)
     estimate = estimate.taken(estimate.known)
     truth = estimate.truth
-    error = None
-    if truth is not None and truth.known.any():
-        known = truth.known
-        error = np.full((len(estimate.time), 6), np.nan)
-        error[known] = consistency.errors(
-            estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
-        )
-    charts = _estimate_charts(estimate) if error is None else _error_charts(estimate, error)
-    table = None if error is None else workflows.accuracy(estimate)
+    states = [] if truth is None else state_errors(estimate, truth)
+    charts = _error_charts(estimate, states) or _estimate_charts(estimate)
+    table = workflows.accuracy(estimate) if states else None
     source = "" if estimate.origin is None else estimate.origin.source
     content = page.page(
         f"Estimate of {source}" if source else f"Estimate {path.name}",
@@ -64,29 +57,16 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     }
 
 
-def _parts(estimate: Estimate) -> tuple[tuple[slice, Callable[[Array], tuple[str, float]]], ...]:
-    """Return the states of the attitude and, if it is estimated, of the bias, with the function that chooses their unit."""
-    parts = ((slice(0, 3), angle_unit), (slice(3, 6), rate_unit))
-    return parts if estimate.has_bias else parts[:1]
-
-
-def _error_charts(estimate: Estimate, error: Array) -> list[str]:
-    """Return a chart of each error, NaN where it is unknown, with the filter's ±3σ if there is a covariance."""
+def _error_charts(estimate: Estimate, states: Sequence[StateError]) -> list[str]:
+    """Return a chart of each error with the filter's ±3σ if there is a covariance."""
     charts = []
-    sigma, settled = estimate.sigma, slice(len(estimate.time) // 20, None)
-    for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
-        if not np.isfinite(error[:, states]).any():
-            continue
-        known = bool(np.isfinite(sigma[:, states]).any())  # an estimate of another program may have no covariance
-        unit, size = unit_of(3.0 * sigma[settled, states] if known else error[settled, states])
-        for k, axis in enumerate(AXES):
-            state = states.start + k
-            bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
-            series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) if known else []
-            series.append(page.Series(label=f"{what.lower()} {axis}", value=value, colour=page.COLOURS[k]))
-            reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
-            label = f"{what.lower()} {axis}, {unit}"
-            charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
+    for k, (what, axis, unit, error, sigma) in enumerate(states):
+        title, bound = f"{what} error {axis}", 3.0 * sigma
+        series = [page.Series(label=title, value=error, colour=page.COLOURS[k % 3])]
+        if np.isfinite(bound).any():  # an estimate of another program may have no covariance
+            series = page.band(-bound, bound, ("+3σ (99.7 %)", "−3σ")) + series
+        reach = style.reach(error, bound)
+        charts.append(page.chart(title.capitalize(), f"{title}, {unit}", estimate.time, series, reach=reach))
     return charts
 
 
@@ -96,8 +76,10 @@ def _estimate_charts(estimate: Estimate) -> list[str]:
     angles = page.lines(angle_labels(estimate.fixed_frame), roll_pitch_yaw(estimate.attitude).T, wraps=True)
     charts = [page.chart("Attitude, Euler angles Z-Y-X", "angle, °", time, angles)]
     if estimate.has_bias:
-        unit, size = rate_unit(3.0 * sigma[len(time) // 20 :, 3:])
-        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", time, page.lines(AXES, estimate.bias.T / size)))
+        unit, size = rate_unit(style.settled(3.0 * sigma[:, 3:]))
+        charts.append(
+            page.chart("Gyro bias", f"gyro bias, {unit}", time, page.lines(style.AXES, estimate.bias.T / size))
+        )
     if estimate.has_covariance:
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
         line = page.lines(["σ, root sum square of the three axes"], [spread])
@@ -123,7 +105,7 @@ def _sensor(name: str, innovations: Innovations) -> str:
     correlation = consistency.autocorrelation(white)
     bounds = correlation.simultaneous_bounds
     lags = page.band(-bounds, bounds, ("99 % bounds, all lags", "lower bound"))
-    lags += page.lines(AXES if correlation.values.shape[1] > 1 else ["innovations"], correlation.values.T)
+    lags += page.lines(style.AXES if correlation.values.shape[1] > 1 else ["innovations"], correlation.values.T)
     nis, (low, high) = innovations.nis / white.shape[1], consistency.mean_bounds(white.shape[1], 1)
     curves = [np.maximum(nis, 1e-4)]
     if number >= 2 * WINDOW:
