@@ -203,6 +203,12 @@ def test_a_tuning_is_reported_from_its_json(folder, tmp_path):
     if headless.CHROMIUM is not None:
         reported = headless.reported(tmp_path / "filter.html", DRAWN, 1000, "--virtual-time-budget=20000")
         assert (reported["drawn"], reported["console"]) == ("1", [])
+    assert (slices["unit"], slices["series"][0]["label"]) == ("−2 Δ log likelihood", "95 % interval")
+    held = json.loads((tmp_path / "filter.json").read_text())
+    held["objective"]["name"], held["parameters"][0]["identified"] = "likelihood of the errors", False
+    (tmp_path / "other.json").write_text(json.dumps(held), encoding="utf-8")
+    (slices,) = charts_of(body(report.write(tmp_path / "other.json").page))
+    assert (slices["unit"], slices["series"][0]["label"]) == ("2 Δ objective", "below the 95 % bound")
     with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.

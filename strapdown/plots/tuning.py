@@ -13,6 +13,16 @@ TALLEST = 15.0
 """Upper limit of the slices, −2 Δ log likelihood."""
 
 
+def measure_of(composite: bool) -> str:
+    """Return the name of what a slice shows, by whether the objective is a composite likelihood."""
+    return "2 Δ objective" if composite else "−2 Δ log likelihood"
+
+
+def interval(identified: bool) -> str:
+    """Return the name of the region between the limits of a parameter."""
+    return "95 % interval" if identified else "below the 95 % bound"
+
+
 def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | None = None) -> Axes:
     """Draw twice the decrease of the log-likelihood along one parameter, with its interval and its previous value."""
     ax = style.axes_or_new(ax)
@@ -23,8 +33,7 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
     if not tuning.composite:
         ax.axhline(3.84, color=style.ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
     lower, upper = max(parameter.lower / unit.factor, values[0]), min(parameter.upper / unit.factor, values[-1])
-    words = "95 % interval" if parameter.identified else "below the 95 % bound"
-    ax.axvspan(lower, upper, color=style.SKY, alpha=0.3, linewidth=0, label=words)
+    ax.axvspan(lower, upper, color=style.SKY, alpha=0.3, linewidth=0, label=interval(parameter.identified))
     ax.axvline(parameter.value / unit.factor, color=style.BLUE, linewidth=0.8, label="tuned")
     before = parameter.start / unit.factor
     drawn = values[0] <= before <= values[-1]
@@ -56,6 +65,6 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
     for ax in axes.flat[number:]:
         ax.set_visible(False)
     for ax in axes[:, 0]:
-        ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
+        ax.set_ylabel(measure_of(tuning.composite))
     style.legend_below(figure, list(axes.ravel()), ncols=5)
     return figure

@@ -10,7 +10,7 @@ import numpy as np
 from strapdown.checks import InputError, one_of
 from strapdown.consistency.judgement import VERDICTS
 from strapdown.files import reading
-from strapdown.plots.tuning import TALLEST
+from strapdown.plots.tuning import TALLEST, interval, measure_of
 from strapdown.report import page
 from strapdown.results import Table
 
@@ -58,7 +58,9 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
         listed = [page.listed(table) for table in tables]
         charts = {}
         if "slices" in content:  # of the command
-            charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
+            measure = measure_of(content["objective"]["name"] != "likelihood")
+            pairs = zip(content["slices"], content["parameters"], strict=True)
+            charts["Likelihood along each parameter"] = [_slice(*pair, measure) for pair in pairs]
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: {error} does not fit a tuning; give the JSON that `strapdown tune` writes beside its filter.toml"
@@ -66,15 +68,12 @@ def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
     return content, listed, charts
 
 
-def _slice(curve: dict[str, Any], parameter: dict[str, Any]) -> str:
+def _slice(curve: dict[str, Any], parameter: dict[str, Any], measure: str) -> str:
     """Return a chart of the likelihood along a parameter, with its interval, its tuned and its previous value."""
     size, unit = parameter.get("si_per_unit", 1.0), parameter.get("unit", "")
     values = np.array(curve["values"]) / size
     first, last = float(values[0]), float(values[-1])
-    value, before, low, high = (
-        float(np.nan if parameter[key] is None else parameter[key] / size)
-        for key in ("value", "start", "lower", "upper")
-    )
+    value, before, low, high = np.array([parameter[key] for key in ("value", "start", "lower", "upper")], float) / size
     low, high = np.fmax(low, first), np.fmin(high, last)
     # A vertical line is two points of one value.
     marks = [x for x in (low, high, value, value, before, before) if first <= x <= last]
@@ -83,13 +82,12 @@ def _slice(curve: dict[str, Any], parameter: dict[str, Any]) -> str:
     up = np.arange(len(x)) % 2 == 1
     line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
     within = (x >= low) & (x <= high)
+    limits = (interval(parameter["identified"]), "its lower limit")
     series = [
-        *page.band(
-            np.where(within, 0.0, np.nan), np.where(within, TALLEST, np.nan), ("95 % interval", "its lower limit")
-        ),
-        page.Series(label="−2 Δ log likelihood", value=np.where(fallen <= TALLEST, fallen, np.nan)),
+        *page.band(np.where(within, 0.0, np.nan), np.where(within, TALLEST, np.nan), limits),
+        page.Series(label=measure, value=np.where(fallen <= TALLEST, fallen, np.nan)),
         page.Series(label="tuned", value=line(value), colour="--c"),
         page.Series(label="before", value=line(before), colour="--b", dash=True),
     ]
     axis = f"{curve['name']}, {unit}" if unit else curve["name"]
-    return page.chart(curve["name"], "−2 Δ log likelihood", x, series, x=axis, log_x=last > 20.0 * first)
+    return page.chart(curve["name"], measure, x, series, x=axis, log_x=last > 20.0 * first)
