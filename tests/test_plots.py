@@ -113,6 +113,7 @@ def test_the_band_of_a_long_record_is_the_envelope_of_sigma():
     line = ax.lines[-1]
     assert len(line.get_xdata()) <= 4002
     assert line.get_ydata().max() == 42.0
+    assert ax.get_ylim()[1] == pytest.approx(1.3 * 42.0)
 
 
 @pytest.mark.parametrize("turns", [3.2, 5000.3])

@@ -27,6 +27,7 @@ THREE_SIGMA = "±3σ (99.7 %)"
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
     """Draw errors (runs, n) over time (n,), s, with the filter's ±3σ (n,), in the unit of the axis, which the caller labels.
 
+    The axis has the range of what comes after the first twentieth of the time, in which a filter converges.
     For a long series the band is dark up to the minimum 3σ of each pixel column and light up to the maximum: σ increases between two
     measurements, and lines that follow it would merge into a grey area that hides the errors.
     """
@@ -39,12 +40,12 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
         ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **light)
         ax.fill_between(edges, -most, -least, **light)
     ax.axhline(0.0, color=style.ink(), linewidth=0.6)
-    label: str | None = f"error, {len(error)} runs" if len(error) > 1 else "error"
-    for component in error:
+    words = f"error, {len(error)} runs" if len(error) > 1 else "error"
+    for k, component in enumerate(error):
+        label = words if k == 0 else None
         ax.plot(*decimated(time, component), color=style.VERMILION, linewidth=0.8, alpha=0.8, label=label)
-        label = None
-    ax.set_xlim(time[0], time[-1])
-    ax.set_xlabel("time, s")
+    reach = style.reach(error.T, 3.0 * sigma)
+    ax.set(xlim=(time[0], time[-1]), ylim=(-reach, reach), xlabel="time, s")
     return ax
 
 
@@ -198,16 +199,13 @@ def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray 
 
 
 class StateError(NamedTuple):
-    """The error of one state over time with the filter's σ, in the unit that both are read best in."""
+    """The error of one state of attitude or bias (n,) with the filter's σ (n,) in the unit that both are read best in; NaN: unknown."""
 
     what: str
-    """attitude or bias"""
     axis: str
     unit: str
     error: Array
-    """(n,); NaN where estimate or truth is unknown."""
     sigma: Array
-    """(n,); NaN without a covariance."""
 
 
 def state_errors(estimate: Estimate, truth: Truth) -> list[StateError]:
@@ -255,8 +253,7 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     figure, axes = style.new_figure(3, columns, size=(5.0 * columns, 6.6), sharex=True, squeeze=False)
     for ax, (what, axis, unit, error, sigma) in zip(axes.T.flat, drawn, strict=True):
         errors_in_envelope(estimate.time, error[None], sigma, ax)
-        reach = style.reach(error, 3.0 * sigma)
-        ax.set(ylim=(-reach, reach), ylabel=f"{what} {axis}, {unit}", xlabel="time, s" if axis == "z" else "")
+        ax.set(ylabel=f"{what} {axis}, {unit}", xlabel="time, s" if axis == "z" else "")
     titles = ("Attitude error, rotation vector in body axes", "Gyro bias error, body axes")
     for ax, words in zip(axes[0], titles, strict=False):
         ax.set_title(words)

@@ -163,7 +163,7 @@ def settled(values: Array) -> Array:
 
 def reach(*curves: Array) -> float:
     """Return the limit ± of an axis that shows the settled part of curves (n, …)."""
-    return 1.3 * max(float(np.nanmax(np.abs(settled(curve)), initial=0.0)) for curve in curves)
+    return 1.3 * (max(float(np.nanmax(np.abs(settled(curve)), initial=0.0)) for curve in curves) or 1.0)
 
 
 ALIKE = 2.0
