@@ -85,13 +85,13 @@ SMALL = {"runs": 2, "unscented_runs": 1, "duration": 10.0}
 """Arguments of a quick test run."""
 
 COLOURS = {
-    "mekf": plots.BLUE,
-    "right-invariant": plots.VERMILION,
-    "two-frame": plots.ink(),
-    "equivariant": plots.YELLOW,
-    "geometric": plots.SKY,
-    "usque": plots.PURPLE,
-    "mahony": plots.GREEN,
+    "mekf": style.BLUE,
+    "right-invariant": style.VERMILION,
+    "two-frame": style.ink(),
+    "equivariant": style.YELLOW,
+    "geometric": style.SKY,
+    "usque": style.PURPLE,
+    "mahony": style.GREEN,
 }
 LOOKS = {"two-frame": {"linestyle": (0, (5, 2, 1, 2)), "zorder": 3, "linewidth": 1.1}}
 """Of lines that nearly coincide with another's."""

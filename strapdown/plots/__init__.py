@@ -33,24 +33,8 @@ from strapdown.plots.estimates import (
     recording_errors,
     states_over_time,
 )
-from strapdown.plots.statistics import (
-    nees_over_time,
-    nis_over_time,
-    runs_overview,
-)
-from strapdown.plots.style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    YELLOW,
-    ink,
-    new_figure,
-    save,
-    save_as,
-)
+from strapdown.plots.statistics import nees_over_time, nis_over_time, runs_overview
+from strapdown.plots.style import new_figure, save, save_as
 from strapdown.plots.tuning import likelihood_slices
 
 __all__ = ["allan_overview", "error_budget", "error_overview", "nees_over_time", "new_figure", "nis_over_time", "save"]
