@@ -6,13 +6,14 @@ import itertools
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
 from strapdown.ahrs import check_conventions, estimating
 from strapdown.kernels import recording_samples
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, sensor_faults
+from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.records.recording import SENSORS, sampled
 from strapdown.units import DEGREE
 
@@ -169,6 +170,34 @@ def test_the_turn_over_a_gap_is_that_of_a_brownian_bridge():
     np.testing.assert_allclose(variance, density * lengths**3 / 12.0, rtol=0.05)
 
 
+def test_the_turn_over_a_gap_that_is_long_for_the_motion():
+    """A rate of variance s², first-order Gauss–Markov with time constant c: the variance in closed form, and the errors themselves."""
+    random, dt, c, s = np.random.default_rng(3), 0.01, 0.3, 1.5
+    kept = np.exp(-dt / c)
+    drive = s * np.sqrt(1.0 - kept**2) * random.standard_normal((400_000, 3))
+    rate = lfilter([1.0], [1.0, -kept], drive, axis=0)[1000:]
+    length = np.array([0.05, 0.3, 1.0, 4.0])
+    variance = sensor_faults.turn_variance_over(rate, length, dt)
+    x = length / c
+    # E (T (w₀ + w_T)/2 − ∫ w)², by integration of the autocorrelation s² exp(−|τ|/c)
+    ends = x**2 * (1.0 + np.exp(-x)) / 2.0
+    between = 2.0 * x * (1.0 - np.exp(-x))
+    inside = 2.0 * (x - 1.0 + np.exp(-x))
+    np.testing.assert_allclose(variance, (s * c) ** 2 * (ends - between + inside), rtol=0.05)
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]), axis=0)])
+    for T, expected in zip(length, variance, strict=True):
+        n = round(T / dt)
+        error = angle[n:] - angle[:-n] - 0.5 * T * (rate[n:] + rate[:-n])
+        assert np.mean(error**2) == pytest.approx(expected, rel=0.05)
+
+
+def test_the_turn_over_a_gap_of_a_rate_that_changes_steadily_is_known():
+    ramp = np.outer(np.arange(5000) * 0.01, [1.0, -2.0, 0.5])
+    length = np.array([0.5, 2.0])
+    change = np.mean((length[:, None] * [1.0, -2.0, 0.5]) ** 2, axis=1)
+    assert np.all(sensor_faults.turn_variance_over(ramp, length, 0.01) < 0.01 * length**2 * change)
+
+
 def off_by(recording: Recording, **options: bool) -> tuple[np.ndarray, np.ndarray, ahrs.AhrsEstimate]:
     """Errors of the attitude, rad, and NEES of it, from 3 s on."""
     ahrs_estimate = ahrs.estimate(recording, latency=0.0, full_covariance=True, **options)
@@ -206,9 +235,16 @@ def test_sigma_grows_over_a_dropout():
         in ahrs_estimate.faults.words[0]
     )
     assert np.mean(nees < 7.81) > 0.9
-    sigma = np.sqrt(ahrs_estimate.estimate.variance[:, :3].sum(axis=1))
+    lost, length = round(0.205 * RATE), np.array([0.205])
+    attitude, first = sensor_delays.gyro_attitude(plain), np.arange(round(3.0 * RATE), len(plain.time) - lost)
+    turn = quaternion.multiply(quaternion.conjugate(attitude[first]), attitude[first + lost])
+    by_ends = quaternion.exp(0.5 * length * (plain.rate[first] + plain.rate[first + lost]))
+    off = quaternion.log(quaternion.multiply(quaternion.conjugate(by_ends), turn))
+    added = sensor_faults.turn_variance_over(plain.rate, length, 1.0 / RATE)
+    assert added == pytest.approx(np.mean(off**2), rel=0.15)
+    variance = ahrs_estimate.estimate.variance[:, :3].sum(axis=1)
     row = int(np.searchsorted(ahrs_estimate.recording.time, 20.1))
-    assert sigma[row + 10] > 1.5 * sigma[row - 20]
+    assert variance[row] - variance[row - 1] == pytest.approx(3.0 * added, rel=0.6)
 
 
 LSB = 1e-3

@@ -55,6 +55,8 @@ STRAIGHT = 1e-4
 """Maximum second difference of such samples, relative to the median one of the recording."""
 LEAD = 0.05
 """Time before such a gap whose samples are left out too, s, so that no step of the filter has some from before an unknown rotation."""
+LAGS, SHARES = 16, 64
+"""Number of lags for which the mean square change of the rate is computed, and of the points of its integral."""
 LONG_INTERVAL = 1.5
 """Ratio of an interval between stamps to the median interval above which its rotation is uncertain."""
 MAX_SAMPLING_ERROR = 8e-3
@@ -263,15 +265,18 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
 
 
 def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
-    """Return the variance (m,), rad² per axis, of rotations computed from the rates at the ends of intervals of duration T, s (m,).
+    """Return the variance (m,), rad² per axis, of rotations by the mean of the rates at the ends of intervals of duration T, s (m,).
 
-    With D the mean square change of the rate over T in the rest of the recording, and the rate between both ends modelled as a Brownian
-    bridge, the variance is ``T² D/12``. D is the largest of those over T, half and a quarter of it: over a period of a swing there is none.
+    With D(τ) the mean square change of the rate over τ, if that is the same everywhere, it is ``∫₀ᵀ τ D(τ) dτ − T² D(T)/4``: T² D(T)/12
+    for a random walk, T² D(T)/4 for rates that have nothing in common, zero for a ramp.
     """
-    lags, place = np.unique(np.clip(np.rint(length / usual).astype(int), 1, len(rate) - 1), return_inverse=True)
-    parts = [{lag, (lag + 1) // 2, (lag + 3) // 4} for lag in lags.tolist()]
-    change = np.array([max(np.mean((rate[lag:] - rate[:-lag]) ** 2) for lag in some) for some in parts])
-    return np.asarray(length**2 / 12.0 * change[place])
+    longest = max(1, min(round(length.max() / usual), len(rate) - 1))
+    lags = np.unique(np.geomspace(1.0, longest, LAGS).round().astype(int))
+    change = [np.mean((rate[lag:] - rate[:-lag]) ** 2) for lag in lags.tolist()]
+    time, square = np.append(0.0, usual * lags), np.append(0.0, change)
+    share = (np.arange(SHARES) + 0.5) / SHARES
+    inner = np.interp(np.multiply.outer(length, share), time, square) @ share / SHARES
+    return np.asarray(length**2 * np.maximum(inner - 0.25 * np.interp(length, time, square), 0.0))
 
 
 STUCK_TIME = 2.0
