@@ -91,6 +91,30 @@ def test_after_a_gap_the_live_filter_finds_the_vertical_again(magnetometer):
         assert np.all(angle[160:] < np.minimum(3.0 * sigma[160:], 0.6))
 
 
+@pytest.mark.parametrize("lost", [5, 10])
+def test_sigma_of_the_live_filter_holds_over_short_gaps(lost):
+    """The rotation over a gap is uncertain by as much as the rate of the seconds before changes over it."""
+    nees = []
+    for seed in range(4):
+        runner = run_with(seed, 25.0, magnetometer=True, amplitude=0.3)
+        first = np.arange(1200, 2400, 137)
+        cut = runner.taken(np.setdiff1d(np.arange(len(runner.time)), np.add.outer(first, np.arange(lost))))
+        after = np.flatnonzero(np.diff(cut.time) > 0.05) + 1
+        live = ahrs.LiveAhrs(interval=1.0 / RATE, magnetometer=True)
+        before = np.inf
+        for k in range(len(cut.time)):
+            live.update(cut.time[k], cut.rate[k], cut.specific_force[k], cut.magnetic_field[k])
+            if k in after + 5:  # the step in which the gap lies has ended
+                error = quaternion.log(quaternion.multiply(quaternion.conjugate(live.attitude), cut.true_attitude[k]))
+                nees.append(error @ np.linalg.solve(live.covariance[:3, :3], error))
+                assert live.variance[:3].sum() > before
+            if k in after - 1:
+                before = live.variance[:3].sum()
+    # The errors are about one axis, so their squares scatter more than those of three.
+    assert np.mean(np.array(nees) < 7.81) > 0.7
+    assert 0.2 < np.mean(nees) / 3.0 < 1.7
+
+
 def test_the_mean_of_an_acceleration_that_changes_is_the_vertical():
     """Over whole periods the mean is exact; the variation gives σ."""
     k, every = 40, 0.025

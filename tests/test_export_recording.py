@@ -123,6 +123,17 @@ def test_c_equals_live_ahrs_to_rounding(compiled):
     assert np.abs(np.diff(expected(name)[:, 4:7], axis=0)).max() > 1e-4  # a rest has corrected the bias
 
 
+def test_after_a_short_gap_c_is_as_uncertain_as_live_ahrs(compiled):
+    """A step of another length has other coefficients, which C computes with its own exponential."""
+    name, f = compiled
+    rows = case(name)[1]
+    rows = [*rows[:620], *rows[640:700]]
+    by_python = by_live(fresh(case(name)[0]), rows)
+    need_close(fed(f, rows), by_python, angle=1e-10, bias=1e-11, variance=1e-8)
+    before, after = by_python[619, 7:10], by_python[624, 7:10]
+    assert after.sum() > before.sum() + 1e-4
+
+
 def test_a_filter_that_looks_for_no_rest_equals_live_ahrs(tmp_path):
     """That of any motion: the frame of its headings has no bias of a rest to drift with."""
     rows = case("iron")[1]

@@ -15,7 +15,6 @@ from strapdown.ahrs import headings, regions
 from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
-    LARGE_TURN,
     LAST_ALIGNMENT,
     Rests,
     align,
@@ -273,7 +272,7 @@ def _alignments(prepared: Prepared, added: Array, parameters: AhrsParameters) ->
     """Return the changes of the state by coarse alignment, by edge of the steps: from the start on, and after large uncertain rotations."""
     time = prepared.record.time
     changes: dict[int, Change] = {}
-    for first in [0, *(1 + np.flatnonzero(added.max(axis=1) > LARGE_TURN**2))]:
+    for first in [0, *(1 + np.flatnonzero(added.max(axis=1) > alignment.LARGE_TURN**2))]:
         rows = slice(first, int(np.searchsorted(time, time[first] + 2.0 * LAST_ALIGNMENT)))
         steps = alignment.Steps(*(column[rows] for column in prepared.steps))
         aligned = alignments(steps, prepared.interval, parameters, unknown=first > 0)

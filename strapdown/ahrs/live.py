@@ -64,8 +64,8 @@ class LiveAhrs:
     sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
     the end of a recording ends a step of the filter. Samples before the first complete one are not used.
 
-    After a gap of more than half a second the attitude is treated as unknown, and is aligned again by the next samples. ``estimate`` knows
-    from the whole recording how much the rate changes over a gap.
+    Over a gap the rotation is as uncertain as the rate of the seconds before changes; after one of more than half a second the attitude is
+    treated as unknown, and is aligned again by the next samples. ``estimate`` knows the change of the rate from the whole recording.
 
     The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here.
 
@@ -176,6 +176,7 @@ class LiveAhrs:
         }
         arrays: Any = kernel.Arrays(**{name: np.zeros(shape, kind) for name, (shape, kind) in shapes.items()})
         arrays.alignment[:] = starting.alignment_memory(unknown=False)
+        arrays.rate_change[0] = kernel.FIRST_RATE_CHANGE
         arrays.force_density[0] = regions.FIRST_DENSITY[0]
         arrays.field_density[0] = regions.FIRST_DENSITY[0] if magnetometer else 1.0
         arrays.force_averages[:] = regions.first_memory(2, step)

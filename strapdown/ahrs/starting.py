@@ -40,8 +40,6 @@ MIN_MOTION = 0.3
 CHANGE_TIME = 0.35
 """Duration over which an acceleration has one direction, s: σ of the mean vertical is the variation, in g, times this over the duration.
 Chosen on 373 starts in motion in 27 recordings of all eight sets."""
-LARGE_TURN = 0.5
-"""σ of an uncertain rotation about an axis, rad, above which the attitude after it is aligned coarsely."""
 SWING_TIME = 0.3
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7

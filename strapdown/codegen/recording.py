@@ -158,6 +158,7 @@ def init(f: Any) -> Any:
     for i, value in enumerate(starting.alignment_memory(unknown=False).tolist()):
         f.alignment[i] = value
     f.aligned_variance[0] = f.over_gap[0] = 0.0
+    f.rate_change[0] = live_imu.FIRST_RATE_CHANGE
     judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
     if r.imu.magnetometer:
         judged.append((f.field_density, f.field_averages, r.imu.arrays.field_averages))
@@ -314,18 +315,31 @@ def carry_to_sample(imu: Any) -> None:
 
 
 def forget_attitude(imu: Any) -> None:
-    """Begin a coarse alignment after a rotation of which nothing is known, and add its variance to that of the attitude."""
+    """Begin a coarse alignment after a rotation of which hardly anything is known."""
     f = imu.filter
     for i, value in enumerate(starting.alignment_memory(unknown=True).tolist()):
         f.alignment[i] = value
     f.aligned_variance[0] = 0.0
+
+
+def add_turn_variance(imu: Any) -> None:
+    """Add the variance of the rotation over gaps to that of the attitude."""
+    f = imu.filter
     for i in range(3):
         f.P[body.place(f.program.n, i, i)] += f.over_gap[0]
 
 
 REPLACED: dict[str, Any] = {
     function.__name__: function
-    for function in (predict_filter, update_filter, show_filter, forget_attitude, end_step, carry_to_sample)
+    for function in (
+        predict_filter,
+        update_filter,
+        show_filter,
+        forget_attitude,
+        add_turn_variance,
+        end_step,
+        carry_to_sample,
+    )
 }
 
 

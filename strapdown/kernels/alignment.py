@@ -103,6 +103,8 @@ their squares; number of the samples of the field, their sum; 1 after a rotation
 SIZE = 11
 UNKNOWN_TURN = 1.0
 """Variance of a rotation of which nothing is known, rad² about each axis."""
+LARGE_TURN = 0.5
+"""σ of an uncertain rotation about an axis, rad, above which the attitude after it is aligned coarsely."""
 AGREES = 1.5
 """Difference of the filter's vertical from the mean, in σ of the mean, up to which the filter is left as it is."""
 
