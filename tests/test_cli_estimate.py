@@ -224,7 +224,7 @@ def test_states_that_the_errors_call_for(run, succeeds, spinning, tmp_path):
     assert (status, error) == (0, "")
     assert "Optional states: gyro.scale." in said
     assert "ppm" in said
-    assert "Still without" not in said
+    assert "does not model" not in said
     assert (tmp_path / "out" / "states.png").exists()
     states = json.loads((tmp_path / "out" / "states.json").read_text())["gyro scale"]
     assert states["components"] == ["z"]
@@ -267,7 +267,7 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record):
     held = read_record(spinning)
     for options in ({"states": False}, {"setup": setup.from_toml(toml)}):
         message = sd.estimate(held, every=1000, **options).remarks[-1]
-        assert "has no state: the gyro's scale factor of 100 ppm; `states=True` adds states" in message
+        assert "does not model the gyro's scale factor of 100 ppm; `states=True` adds states" in message
     assert len(sd.estimate(read_record(record), every=100).remarks) == 1
     estimate = sd.estimate(held, every=1000)
     assert estimate.setup.states.names == ("gyro.scale",)
@@ -275,7 +275,7 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record):
 
 
 def test_the_verdict_names_what_the_filter_has_no_state_for(run, succeeds, spinning, tmp_path):
-    no_state = "; the filter has no state for the gyro's scale factor of 100 ppm"
+    no_state = "; the filter does not model the gyro's scale factor of 100 ppm"
     for options, missing in (((), False), (("--no-states",), True)):
         succeeds("estimate", spinning, "--out", tmp_path / "out", "--every", 10, *options)
         said = run("check", tmp_path / "out" / "estimate.h5")[1]
@@ -317,7 +317,7 @@ def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, succ
     assert status == 3
     headline = said[said.index("cannot tell: attitude and innovations consistent; bias not testable from this run") :]
     assert "only an error of σ of ×" in headline
-    assert "no state for the gyro's scale factor of 200 ppm, the gyro's flicker of 0.3 °/h" in headline
+    assert "does not model the gyro's scale factor of 200 ppm, the gyro's flicker of 0.3 °/h" in headline
     parts = json.loads((tmp_path / "check.json").read_text())["parts"]
     errors = {part["of"]: part["detectable_error"] for part in parts}
     assert errors["attitude"] < 1.5

@@ -218,7 +218,7 @@ def test_a_state_that_nothing_tests_is_named():
     noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
     setup = FilterSetup(process_noise=noise, bias_sigma=1e-3)
     judgement = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
-    assert judgement.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
+    assert judgement.reason.endswith("the filter does not model the gyro's asymmetry of 9 ppm")
     plain = json.loads(json.dumps(blind.summary(), allow_nan=False))["parts"]
     assert plain[-1] == {"of": "bias", "detectable_error": None, "why": "the truth is not known"}
 

@@ -607,7 +607,12 @@ def test_initial_errors_may_differ_from_the_filters_model():
 def test_what_is_left_out_or_beyond_linear_is_reported():
     scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
     analysis = covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=2)
-    assert analysis.left_out == ("gyro rate resolution",)
+    assert analysis.left_out == ("the gyro's quantisation",)
+    early = dataclasses.replace(scenario.gyro, timestamp_offset=-0.01)
+    early = dataclasses.replace(scenario, gyro=early, gyro_preset="")
+    early = covariance.analyse(early, setup.FilterSetup.for_scenario(early, states=False), epochs=2)
+    assert early.left_out == ("the gyro's quantisation", words := "the gyro's time stamps, late by -0.01 s")
+    assert words in early.unmodelled
     assert any("accelerometer" in text for text in analysis.beyond_linear)
     wide = covariance.analyse(
         white("spin", 10.0),
@@ -723,7 +728,7 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     assert succeeds("covariance", "spin", "--filter", "filter.toml", "--out", "by-file", *options)
     by_file = (tmp_path / "by-file" / "covariance.json").read_text(encoding="utf-8")
     said = succeeds("covariance", "spin", "--no-states", *options)
-    assert "The filter has no state for the gyro's scale factor" in said
+    assert "The filter does not model the gyro's scale factor" in said
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
     saved = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import sici
 
-from strapdown import consistency, scenarios
+from strapdown import consistency, records, scenarios
 from strapdown.estimation import setup
 from strapdown.montecarlo.scalar import start
 
@@ -97,9 +97,7 @@ def test_every_built_in_scenario_is_here():
 def test_the_states_are_those_that_the_errors_call_for(name):
     filter_setup, scenario = matched(name), scenarios.load_scenario(name)
     assert (() if filter_setup.states is None else filter_setup.states.names) == CALLED_FOR[name]
-    missing = setup.unmodelled_errors(
-        scenario.gyro, scenario.sensors, filter_setup.states, gravity_f=scenario.gravity_f
-    )
+    missing = setup.unmodelled_errors(records.Origin(gyro=scenario.gyro, scenario=scenario), filter_setup)
     assert missing == (("the gyro's quantisation",) if name == "hand-held" else ())
 
 

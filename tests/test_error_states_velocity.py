@@ -14,7 +14,7 @@ from measured import UP, assert_inside, drawn_start, in_body, series_of, state_e
 
 from benchmarks import recordings as leaderboard
 from sims import hand_held
-from strapdown import ahrs, consistency, estimation, kinematics, quaternion
+from strapdown import ahrs, consistency, estimation, kinematics, quaternion, records, scenarios
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation import model as modelling
@@ -23,7 +23,6 @@ from strapdown.estimation.observability import state_names
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
@@ -455,10 +454,14 @@ def test_a_setup_runs_it():
 
 def test_what_no_state_covers_is_reported():
     moved = Accelerometer(name="acc", sigma=0.05, rate=25.0, acceleration_f=lambda t: np.zeros((*np.shape(t), 3)))
+    held = dataclasses.replace(moved, acceleration_f=None)
     words = "the acceleration of the point where the acc is mounted"
-    assert words in setup.unmodelled_errors(GyroSpec(), (moved,))
-    assert words not in setup.unmodelled_errors(GyroSpec(), (moved,), States(sensors={"acc": TOLD}))
-    assert words not in setup.unmodelled_errors(GyroSpec(), (dataclasses.replace(moved, acceleration_f=None),))
+    plain = setup.FilterSetup(process_noise=NOISE, bias_sigma=3e-3)
+    told = dataclasses.replace(plain, states=States(sensors={"acc": TOLD}))
+    for sensor, belief, said in ((moved, plain, True), (moved, told, False), (held, plain, False)):
+        scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), sensors=(sensor,))
+        origin = records.Origin(gyro=scenario.gyro, scenario=scenario)
+        assert (words in setup.unmodelled_errors(origin, belief)) == said
 
 
 # ------------------------------------------------------------------------------------------------------------------ in the hand

@@ -259,8 +259,10 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     (block,) = states.blocks({})
     np.testing.assert_allclose(block.sigma, [1e-5, 2e-5, 2e-11], rtol=1e-12)  # an axis without one is none, in effect
     missing = "the gyro's bias over temperature"
-    assert missing in setup.unmodelled_errors(linear.gyro)
-    assert missing not in setup.unmodelled_errors(linear.gyro, (), states)
+    plain = setup.FilterSetup.for_scenario(linear, states=False)
+    origin = records.Origin(gyro=linear.gyro, scenario=linear)
+    assert missing in setup.unmodelled_errors(origin, plain)
+    assert missing not in setup.unmodelled_errors(origin, replace(plain, states=states))
     # With a quadratic bias c₂ (T − T₀)² over T₀ ± h the mean square of the slope 2 c₂ (T − T₀) is (2 c₂ h)²/3.
     bent = replace(warm, coefficients=np.array([[0.0] * 3, [0.0] * 3, [1e-6] * 3]), sigma=np.zeros((3, 3)))
     course = scenarios.Temperature(start=20.0, end=40.0)

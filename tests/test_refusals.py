@@ -187,16 +187,17 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
     result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
     assert ("Causes by their effect on the likelihood" in result.output) == known
-    diagnosis = json.loads((tmp_path / "check.json").read_text())["diagnosis"]
+    content = json.loads((tmp_path / "check.json").read_text())
     asymmetry = "the gyro's asymmetry of 2e+03 ppm"
     if known:
         missing = ["the gyro's scale factor of 1e+03 ppm", asymmetry]
-        assert f"errors for which this filter has no state: {', '.join(missing)}" in result.output
-        assert diagnosis["without_a_state"] == missing
+        assert f"the filter does not model {', '.join(missing)}" in " ".join(result.output.split())
+        assert content["unmodelled"] == missing
     else:
         reason = "the search supports filters of attitude and bias only, and this one has the states gyro.scale"
         assert f"Causes were not searched for: {reason}." in result.output
-        assert diagnosis == {"not_looked_for": reason, "without_a_state": [asymmetry]}
+        assert content["diagnosis"] == {"not_looked_for": reason}
+        assert content["unmodelled"] == [asymmetry]
 
 
 def test_errors_are_taken_at_the_same_times(folder):

@@ -156,7 +156,7 @@ def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folde
 
 
 def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, tmp_path):
-    assert "no state for" not in body(folder / "campaign.html")
+    assert "does not model" not in body(folder / "campaign.html")
     assert ">reason<" not in body(folder / "campaign.html")
     held = campaign.read(folder / "campaign.h5")
     spec = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 0.05))
@@ -165,7 +165,7 @@ def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, tmp_pat
     content = body(report.write(tmp_path / "scaled.h5").page)
     assert "<strong>Not consistent.</strong>" in content
     assert (
-        "; the filter has no state for the gyro&#x27;s scale factor of 5e+04 ppm"
+        "; the filter does not model the gyro&#x27;s scale factor of 5e+04 ppm"
         in content[: content.index("<h2>Key numbers")]
     )
 

@@ -13,7 +13,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, Origin
 from strapdown.vectors import VectorMeasurements
 
 SETUP = FilterSetup(
@@ -166,19 +166,24 @@ def test_truth_travels_in_the_estimate_file(tmp_path):
     assert not (tmp_path / "bad.h5").exists()
 
 
-def test_what_the_filter_has_no_state_for_is_reported_in_words():
+def unmodelled(scenario, states=None):
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), states=states)
+    return setup.unmodelled_errors(Origin(gyro=scenario.gyro, scenario=scenario), filter_setup)
+
+
+def test_what_the_filter_does_not_model_is_reported_in_words():
     clean = scenarios.load_scenario("two-stars")
-    assert setup.unmodelled_errors(clean.gyro, clean.sensors) == ()
+    assert unmodelled(clean) == ()
     orbit = scenarios.load_scenario("low-orbit")
-    words = " and ".join(setup.unmodelled_errors(orbit.gyro, orbit.sensors))
+    words = " and ".join(unmodelled(orbit))
     for part in ("misalignment", "flicker of 2 °/h", "hard iron of the magnetometer"):
         assert part in words
     held = scenarios.load_scenario("hand-held")
-    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors))
+    words = " and ".join(unmodelled(held))
     for part in ("quantisation", "lever arm", "correlated noise of the magnetometer"):
         assert part in words
     some = setup.FilterSetup.for_scenario(held, states=True).states.select(("gyro.drift", "accelerometer.lever"))
-    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, some))
+    words = " and ".join(unmodelled(held, some))
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
     assert "flicker" not in words
@@ -191,25 +196,26 @@ def test_a_gyro_with_unequal_axes_makes_its_filter_pessimistic_and_that_is_said(
     unequal = dataclasses.replace(scenario.gyro, angle_random_walk=(0.25 * arw, 0.25 * arw, arw))
     other = dataclasses.replace(scenario, gyro=unequal, gyro_preset="")
     plan = sd.workflows.plan(other)
-    (words,) = plan.limits
-    assert "(angle random walk ×4)" in words
+    (words,) = plan.unmodelled
+    assert "(angle random walk ×4; σ about the quieter ones are too large" in words
     analysis = sd.covariance_analysis(other, plan.setup, epochs=5)
     ratio = np.sqrt(np.diagonal(analysis.filter_covariance[-1])) / analysis.rms[-1]
     assert np.all(ratio[[0, 1]] > 1.1)
     assert np.all(ratio[[0, 1]] < 4.0)
     assert ratio[2] == pytest.approx(1.0, abs=0.01)
     result = sd.estimate(sd.simulate(other))
-    assert words in sd.check(result).limits
-    assert f"{words[0].upper()}{words[1:]}." in result.remarks
-    assert words in sd.monte_carlo(other, runs=8).judge().limits
+    assert words in sd.check(result).unmodelled
+    assert f"The filter does not model {words}." in result.remarks
+    assert words in sd.monte_carlo(other, runs=8).judge().unmodelled
+    assert analysis.unmodelled == (words,)
 
-    assert sd.workflows.plan(scenario).limits == ()
+    assert sd.workflows.plan(scenario).unmodelled == ()
     quieter = dataclasses.replace(
         plan.setup, process_noise=sd.ProcessNoise(angle_random_walk=0.5 * arw, rate_random_walk=0.0)
     )
-    assert sd.workflows.plan(other, setup=quieter).limits == ()
+    assert sd.workflows.plan(other, setup=quieter).unmodelled == ()
     none = dataclasses.replace(unequal, bias_instability=(0.0, 0.0, 1e-6))
-    assert "bias instability ×∞" in sd.workflows.plan(dataclasses.replace(other, gyro=none)).limits[0]
+    assert "bias instability ×∞" in sd.workflows.plan(dataclasses.replace(other, gyro=none)).unmodelled[-1]
 
 
 @pytest.mark.parametrize(
@@ -223,7 +229,18 @@ def test_a_gyro_with_unequal_axes_makes_its_filter_pessimistic_and_that_is_said(
     ],
 )
 def test_errors_of_the_gyro_that_no_state_covers_are_named(error, words):
-    assert setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, **error)) == (words,)
+    gyro = GyroSpec(angle_random_walk=1e-5, **error)
+    assert unmodelled(dataclasses.replace(scenarios.load_scenario("two-stars"), gyro=gyro, gyro_preset="")) == (words,)
+
+
+def test_states_are_advised_to_the_filter_that_can_have_them():
+    spin = scenarios.load_scenario("spin")
+    origin, plain = Origin(gyro=spin.gyro, scenario=spin), setup.FilterSetup.for_scenario(spin, states=False)
+    own = dataclasses.replace(plain, estimator=lambda record, initial: None)
+    for belief, advised in ((plain, True), (own, False)):
+        (words,) = setup.unmodelled_words(origin, belief)
+        assert ("`states=True` adds states" in words) == advised
+    assert setup.unmodelled_words(origin, setup.FilterSetup.for_scenario(spin)) == []
 
 
 @pytest.mark.parametrize("name", ["mine.py:textbook", "folder.x/mine.py"])
@@ -245,7 +262,7 @@ def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
         ({"robust": Robust()}, ()),
     ):
         changed = dataclasses.replace(plain, **change)
-        assert setup.for_record.unmodelled_errors(record.origin, changed) == outliers
+        assert setup.unmodelled_errors(record.origin, changed) == outliers
         plan = montecarlo.Plan(scenario=faulty, setup=changed, epochs=20)
         assert plan.unmodelled == outliers
         estimate = sd.estimate(record, **change)

@@ -110,7 +110,7 @@ def test_states_are_added_to_a_filter_without_them(succeeds, run, tmp_path, scal
     """Its own message advises it: a scale factor of 2000 ppm at 3 °/s is no white noise."""
     plain, out, shared = tmp_path / "plain.toml", tmp_path / "states.toml", ("--starts", 1, "-o")
     said = succeeds("tune", scaled, "--no-states", "--free", "star 1.sigma", *shared, plain)
-    assert "for which the filter has no state: --states adds states for most errors." in " ".join(said.split())
+    assert "; --states adds states for most of these errors." in " ".join(said.split())
     free = ("--states", "--free", "gyro.arw,gyro.scale_sigma")
     for options in (("--filter", plain), ()):
         said = succeeds("tune", scaled, *options, *free, *shared, out)

@@ -46,6 +46,8 @@ def check(
     With --record, the verdict combines the statistics with a search for causes. With --truth, the estimate may be from any filter; clocks
     and frames are compared first. Without a truth, an estimate of another program is judged by its innovations, if it has any.
     """
+    from strapdown.recordings.recordfiles import read_record
+
     how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     # A missing file is reported as one of this package.
     own = foreign.truth is None and (not result.exists() or bool(reading.kind(result)))
@@ -63,6 +65,9 @@ def check(
             raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
         if filter_file is not None:
             held = replace(held, setup=sd.estimation.setup.read_setup(filter_file))
+        if record is not None:  # whose specification is that of the estimate, or replaces it
+            source = read_record(record)
+            held = replace(held, origin=source.origin or held.origin)
         with reading.from_file(result):
             judgement = sd.check(held, **how)
         content: dict[str, Any] = {"source": result.name, "kind": reading.kind(result)}
@@ -75,7 +80,7 @@ def check(
     else:
         ui.say(*table.notes)
     if record is not None:
-        content["diagnosis"], causes = _diagnosed(held, record, judgement)
+        content["diagnosis"], causes = _diagnosed(held, source, record, judgement)
         if causes is not None:
             judgement, words = causes.judgement, causes.words
     ui.say(words)
@@ -97,24 +102,17 @@ def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tup
     return checked.judgement, {"source": own.source, "kind": "estimate from elsewhere", **checked.summary()}
 
 
-def _diagnosed(held: Any, record: Path, judgement: Any) -> tuple[dict[str, Any], Any]:
+def _diagnosed(held: Any, source: Any, record: Path, judgement: Any) -> tuple[dict[str, Any], Any]:
     """Print the causes found from a record; return them for JSON, and, if they count in the verdict, as they are."""
-    from strapdown.estimation.setup.for_record import unmodelled_errors
-    from strapdown.recordings.recordfiles import read_record
-    from strapdown.workflows.filters import no_state_words
-
-    source = read_record(record)
-    missing = unmodelled_errors(source.origin, held.setup)
-    ui.say(*no_state_words(source.origin, held.setup))
     with ui.progress_bar("searching for causes"), reading.from_file(record):
         causes, reason = sd.diagnose(held, source, judgement=judgement)
     if causes is None:
         ui.say(f"Causes were not searched for: {reason}.")
-        return {"not_looked_for": reason, "without_a_state": missing}, None
+        return {"not_looked_for": reason}, None
     ui.show(causes.listing(), title="Causes by their effect on the likelihood", notes=False)
     if reason:
         ui.say(f"{reason}; therefore the verdict is based on the statistics only.", causes.cause_words)
-    return {**causes.summary(), "without_a_state": missing}, None if reason else causes
+    return causes.summary(), None if reason else causes
 
 
 @ui.command()

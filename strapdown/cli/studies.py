@@ -58,7 +58,6 @@ def covariance(
     form: Format = FORMAT,
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
-    from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.workflows.filters import filter_for_scenario, state_words
 
     body, name = sd.scenarios.load_scenario(scenario), Path(scenario).stem
@@ -73,11 +72,8 @@ def covariance(
     what = "the filter given" if from_file else "the filter that matches it"
     ui.say(f"{body.name or name}, {what}, integration {filter_setup.integration.name}.\n")
     ui.show(result.listing())
-    if not from_file:
-        if states is None and filter_setup.states is not None:
-            ui.say(state_words(filter_setup.states.names))
-        missing = unmodelled_errors(sd.records.Origin(gyro=body.gyro, scenario=body), filter_setup)
-        ui.say(f"The filter has no state for {', '.join(missing)}." if missing else "")
+    if not from_file and states is None and filter_setup.states is not None:
+        ui.say(state_words(filter_setup.states.names))
     write_json(out / "covariance.json", {"scenario": body.name or name, **result.summary()})
     figure = sd.plots.error_budget(result, title=f"{body.name or name}: predicted errors")
     ui.written(out / "covariance.json", *sd.plots.save_as({out / "budget": figure}, form))

@@ -25,7 +25,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
-from strapdown.estimation.setup.for_record import unequal_axes, unmodelled_errors
+from strapdown.estimation.setup import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import ByValue, Column, Listed, Table, figure
@@ -168,7 +168,7 @@ class Judgement(ByValue, Listed):
     required : float, default 1.5
         Largest detectable error of σ of a part that counts as tested.
     unmodelled : tuple of str, default empty
-        Specified errors that the filter has no state for.
+        Specified errors that the filter does not model.
     """
 
     verdict: Answer
@@ -275,7 +275,7 @@ def judge(
     -------
     Judgement
         The verdict; its ``parts`` have the error of their σ that the tests would have detected. Error states have no truth here and are not
-        tested. Errors that the estimate's ``origin`` specifies and its filter has no state for are named in the verdict.
+        tested. Errors that the estimate's ``origin`` specifies and its filter does not model are named in the verdict.
 
     References
     ----------
@@ -315,7 +315,6 @@ def judge(
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         limits.append(f"the σ of {listed(tuple(estimate.error_states))} is not tested: {NO_TRUTH}")
-    limits += unequal_axes(estimate.origin, estimate.setup)
     judged = concluded(
         _one_sided(findings) if estimate.motion else findings,
         limits,
@@ -474,8 +473,8 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; their ``rejected`` is ignored and evaluated again.
 
-    ``parts``: reason by part (:class:`Part`) why no test covers it, empty if one does; ``unmodelled``: errors that the filter has no state
-    for; ``runs``: the runs, in words; ``agree``: what is said of the parts that were tested.
+    ``parts``: reason by part (:class:`Part`) why no test covers it, empty if one does; ``unmodelled``: errors that the filter does not
+    model; ``runs``: the runs, in words; ``agree``: what is said of the parts that were tested.
     """
     contradicts = holm([finding.p_value for finding in findings], 1.0 - confidence_level)
     # Bounds at the significance level at which Holm's procedure has stopped.
@@ -488,7 +487,7 @@ def concluded(
     tested = tuple(Part(of=of, detectable_error=errors.get(of, math.inf), why=why) for of, why in parts.items())
     verdict, reason = _verdict(marked, tested, required, runs, agree)
     if unmodelled:
-        reason += f"; the filter has no state for {', '.join(unmodelled)}"
+        reason += f"; the filter does not model {', '.join(unmodelled)}"
     return Judgement(
         verdict=verdict,
         reason=reason,

@@ -24,11 +24,12 @@ from strapdown.covariance.result import LARGEST_LINEAR, Analysis
 from strapdown.covariance.trajectory import Trajectory, noise_of, trajectory_of, unit_of
 from strapdown.estimation import forward
 from strapdown.estimation.schedule import Schedule
-from strapdown.estimation.setup import FilterSetup, need_setup
+from strapdown.estimation.setup import FilterSetup, need_setup, specified_errors, unmodelled_errors
 from strapdown.kernels import analysis
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.walk import walk
+from strapdown.records import Origin
 from strapdown.scenarios import Scenario
 from strapdown.units import DEGREE
 
@@ -98,6 +99,7 @@ def analyse(
     columns = [*fixed, *considered]
     random = random_sources(scenario, attitude_sigma, bias_sigma)
     out = _propagated(scenario, path, random, columns, len(fixed))
+    origin = Origin(gyro=scenario.gyro, scenario=scenario)
     sizes = sizes_of(path, columns, out.residual)
     real = [k for k, column in enumerate(fixed) if column.sensor < 0 or sizes[k] > MIN_ERROR]
     analysis = Analysis(
@@ -117,7 +119,8 @@ def analyse(
         drawn=tuple(fixed[k].name for k in real if fixed[k].drawn)
         if setup.states is not None and setup.states.has_constants
         else (),
-        left_out=_left_out(scenario, setup),
+        unmodelled=unmodelled_errors(origin, setup),
+        left_out=_left_out(origin, setup),
         beyond_linear=(),
     )
     return dataclasses.replace(analysis, beyond_linear=_beyond_linear(analysis, columns, sizes))
@@ -209,16 +212,11 @@ def _measurements(events: Schedule) -> Measurements:
     return events.measurements._replace(noise=read_only(noise))
 
 
-def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
+def _left_out(origin: Origin, setup: FilterSetup) -> tuple[str, ...]:
     """Return the errors of a scenario, and the parts of a filter, that the analysis does not include."""
-    spec = scenario.gyro
-    timing = ("sampling_jitter", "timestamp_error", "timestamp_offset", "drop_probability")
-    names = ("quantization", "rate_resolution", *timing)
-    terms = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
-    if scenario.saturation:
-        terms.append(scenario.saturation)
-    if spec.temperature is not None:
-        terms.append("gyro bias over temperature")
+    terms = [error.words for error in specified_errors(origin) if not error.analysed]
+    if origin.scenario.gyro.drop_probability > 0.0:
+        terms.append("the gyro's lost samples")
     if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):
         terms.append("states for the gyro bias over temperature")
     terms += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]

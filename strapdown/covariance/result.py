@@ -45,6 +45,8 @@ class Analysis(Listed):
         Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter.
     drawn : tuple of str
         Those of the fixed errors that a Monte Carlo draws in each run, because the filter has states for them.
+    unmodelled : tuple of str
+        Errors of the scenario that the filter does not model, in words.
     left_out : tuple of str
         Errors of the scenario that the analysis does not include.
     beyond_linear : tuple of str
@@ -63,6 +65,7 @@ class Analysis(Listed):
     considered_errors: Array
     expected_nis: Mapping[str, float]
     drawn: tuple[str, ...]
+    unmodelled: tuple[str, ...]
     left_out: tuple[str, ...]
     beyond_linear: tuple[str, ...]
 
@@ -86,6 +89,7 @@ class Analysis(Listed):
             "the filter models.",
             f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
             self.words,
+            *([f"The filter does not model {', '.join(self.unmodelled)}."] if self.unmodelled else []),
             *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
             *(f"Beyond linear: {effect}; use a Monte Carlo (`strapdown montecarlo`)." for effect in self.beyond_linear),
         ]
@@ -218,6 +222,7 @@ class Analysis(Listed):
             "random": by_source(self.sources, random),
             "fixed": by_source(self.fixed, self.fixed_errors),
             "considered": by_source(self.considered, self.considered_errors),
+            "unmodelled": list(self.unmodelled),
             "left_out": list(self.left_out),
             "beyond_linear": list(self.beyond_linear),
         }

@@ -135,11 +135,14 @@ def words(campaign: Campaign, judgement: Judgement) -> list[str]:
     sentences = [f"{campaign.extent}, computed in {campaign.seconds:.3g} s.", judgement.words]
     if judgement.verdict == "cannot tell":
         sentences.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
-    mekf, specified = filter_setup.estimator == setup.MEKF, (scenario.gyro, scenario.sensors, scenario.gravity_f)
-    if judgement.unmodelled and mekf and filter_setup.states is None and setup.has_states_for(*specified):
-        sentences.append(f"{Hint('states', True)} adds states for most of these errors to the filter.")
-    doubtful = judgement.verdict != "consistent" and mekf and filter_setup.integration.name == "one-sample"
-    if doubtful and setup.commutes_badly(scenarios.simulate(scenario), filter_setup.process_noise.angle_random_walk):
+    if judgement.unmodelled and (remedy := setup.remedy(campaign.plan.origin, filter_setup)):
+        sentences.append(f"{remedy}.")
+    one_sample = filter_setup.estimator == setup.MEKF and filter_setup.integration.name == "one-sample"
+    if (
+        judgement.verdict != "consistent"
+        and one_sample
+        and setup.commutes_badly(scenarios.simulate(scenario), filter_setup.process_noise.angle_random_walk)
+    ):
         sentences.append(
             "One-sample integration drifts in this motion (coning) by more than the gyro's noise explains; give a filter with another "
             "integration, such as matched-1-8-8."

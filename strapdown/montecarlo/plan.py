@@ -190,16 +190,12 @@ class Plan(ByValue):
 
     @property
     def unmodelled(self) -> tuple[str, ...]:
-        """Errors, in words, that the scenario specifies and the filter has no state for."""
-        return setup.for_record.unmodelled_errors(self._origin, self.setup)
+        """Errors, in words, that the scenario specifies and the filter does not model."""
+        return setup.unmodelled_errors(self.origin, self.setup)
 
     @property
-    def limits(self) -> tuple[str, ...]:
-        """What the filter's σ do not represent, in words, and is no error without a state."""
-        return setup.for_record.unequal_axes(self._origin, self.setup)
-
-    @property
-    def _origin(self) -> Origin:
+    def origin(self) -> Origin:
+        """Origin of the records of the runs."""
         return Origin(gyro=self.scenario.gyro, scenario=self.scenario)
 
     def to_table(self) -> dict[str, Any]:

@@ -204,7 +204,7 @@ class Statistics(ByValue, Listed):
         parts += [name for name in STATES if name in self.subsets]
         return concluded(
             findings,
-            [] if self.plan is None else self.plan.limits,
+            [],
             confidence_level,
             parts=dict.fromkeys(parts, ""),
             required=detectable_error,

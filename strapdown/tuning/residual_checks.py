@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import Hint
 from strapdown.consistency import Judgement
 from strapdown.consistency.judgement import concluded
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
-from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
@@ -55,8 +53,8 @@ class Unmodelled:
     """A gyro's scale factor as an explanation of what the filter models as noise."""
     causes: tuple[Cause, ...] = ()
     """Likely causes, if a test in :data:`SHAPES` fails."""
-    missing: tuple[str, ...] = ()
-    """Errors that the record specifies and the filter has no state for."""
+    remarks: tuple[str, ...] = ()
+    """What the record specifies and the filter does not model, one sentence."""
 
     @property
     def moves_with_the_rate(self) -> bool:
@@ -104,12 +102,7 @@ class Unmodelled:
             sentences.append(f"And {left} more of {len(self.judgement.findings)} tests contradict the tuned filter.")
         if self.causes:
             sentences.append(f"Most likely cause: {self.causes[0].words}.")
-        if self.missing:
-            sentences.append(
-                f"The record specifies {', '.join(self.missing)}, for which the filter has no state: {Hint('states', True)} adds "
-                "states for most errors."
-            )
-        return tuple(sentences)
+        return (*sentences, *self.remarks)
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
@@ -135,7 +128,7 @@ def unmodelled(case: Case, filter_setup: FilterSetup) -> Unmodelled:
     if used.gate is not None:
         # A gate removes the tails of the innovations and passes small outliers: NIS and normality are not evidence then.
         kept = tuple(finding for finding in judgement.findings if finding.name not in ("NIS", "normality"))
-        judgement = concluded(kept, judgement.limits, PROBABILITY, parts={})
+        judgement = concluded(kept, judgement.limits, PROBABILITY, parts={}, unmodelled=judgement.unmodelled)
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
     if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):
@@ -145,7 +138,7 @@ def unmodelled(case: Case, filter_setup: FilterSetup) -> Unmodelled:
         judgement=judgement,
         scale_factor=scale_factor(setup.modelled_record(record, used), used.process_noise, initial),
         causes=causes,
-        missing=unmodelled_errors(record.origin, filter_setup),
+        remarks=tuple(setup.unmodelled_words(record.origin, filter_setup)),
     )
 
 

@@ -228,4 +228,4 @@ def _judged(case: Case, filter_setup: FilterSetup) -> tuple[Estimate, Truth | No
     part: dict[str, Any] = {name: value[inside] for name, value in values.items() if value is not None}
     if truth is not None:
         truth = truth.taken(slice(None, None, every)).taken(inside)
-    return replace(estimate, innovations=innovations, **part), truth
+    return replace(estimate, innovations=innovations, setup=used, origin=record.origin, **part), truth

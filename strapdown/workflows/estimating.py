@@ -230,7 +230,6 @@ def _run_record(
     if smooth and count("every", every) > 1:
         raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
     filter_setup, notes = filter_for_record(record, noise, setup, initial, states, changes)
-    notes += [f"{words[0].upper()}{words[1:]}." for words in for_record.unequal_axes(record.origin, filter_setup)]
     modelled = setups.modelled_record(record, filter_setup)
     if initial is None:
         begin = for_record.start(modelled, filter_setup)

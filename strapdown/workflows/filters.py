@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from strapdown import ahrs, allan, gyro
 from strapdown.checks import Hint, InputError, instance, one_of
 from strapdown.estimation import setup as setups
-from strapdown.estimation.setup import FilterSetup, for_record
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
-from strapdown.records import ImuRecord, Origin
+from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
 from strapdown.units import STANDARD_GRAVITY
 
@@ -62,7 +62,7 @@ def filter_for_record(
         need_alone(noise, states)
         need_angles(setup, record)
         setup = dataclasses.replace(setup, **changes)
-        return setup, no_state_words(record.origin, setup)
+        return setup, setups.unmodelled_words(record.origin, setup)
     if not isinstance(noise, ProcessNoise):
         return matched_filter(
             record, None if noise is None else specification_of(noise), states=states, changes=changes
@@ -110,7 +110,7 @@ def matched_filter(
     """Return the filter that matches a record's specifications, with ``changes`` of its fields, and remarks on errors and their states."""
     filter_setup = dataclasses.replace(setups.FilterSetup.for_record(record, spec, states=states), **(changes or {}))
     if states is False or (states is None and filter_setup.states is None):
-        return filter_setup, no_state_words(record.origin, filter_setup)
+        return filter_setup, setups.unmodelled_words(record.origin, filter_setup)
     notes = []
     if record.origin is None or record.origin.scenario is None:
         notes.append(
@@ -122,8 +122,7 @@ def matched_filter(
         notes.append(state_words(filter_setup.states.names))
     else:
         notes.append(f"Optional states: {', '.join(filter_setup.states.names)}.")
-    missing = for_record.unmodelled_errors(record.origin, filter_setup)
-    return filter_setup, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+    return filter_setup, notes + setups.unmodelled_words(record.origin, filter_setup)
 
 
 def filter_for_scenario(
@@ -150,13 +149,3 @@ def state_words(names: Sequence[str]) -> str:
         f"The filter has states for the specified errors, {', '.join(names)}: without them its σ would be too small "
         f"({Hint('states', False)} omits them)."
     )
-
-
-def no_state_words(origin: Origin | None, filter_setup: FilterSetup) -> list[str]:
-    """Return a message about specified errors for which a filter has no state, with a remedy; empty if there are none."""
-    missing = for_record.unmodelled_errors(origin, filter_setup)
-    if origin is None or origin.gyro is None or not missing:
-        return []
-    adds = filter_setup.states is None and setups.has_states_for(origin.gyro, *setups.specified(origin))
-    remedy = f"; {Hint('states', True)} adds states for most of them" if adds else ""
-    return [f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."]

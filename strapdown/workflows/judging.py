@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -126,7 +127,8 @@ def diagnose(
     initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
     used = accepted(record, result)
-    causes = diagnosis.diagnose(used, filter_setup, initial, judgement=judgement or check(result))
+    judgement = judgement or check(replace(result, origin=record.origin or result.origin))
+    causes = diagnosis.diagnose(used, filter_setup, initial, judgement=judgement)
     if filter_setup.robust is not None:
         return causes, "The filter weights measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in result.events):

@@ -9,6 +9,7 @@ the names of its keys; a setup is read back bit for bit.
 - ``running``: The filter of a setup over a record: :func:`run`, :func:`smooth`.
 - ``files``: Setups in TOML files.
 - ``for_record``: The initial state for a record.
+- ``unmodelled``: What is specified and a filter does not model.
 - ``estimate_files``: Estimates in HDF5 files, with their filter.
 """
 
@@ -25,9 +26,6 @@ from strapdown.estimation.setup.filter_setup import need_angles as need_angles
 from strapdown.estimation.setup.filter_setup import need_mekf as need_mekf
 from strapdown.estimation.setup.filter_setup import need_setup as need_setup
 from strapdown.estimation.setup.matching import commutes_badly as commutes_badly
-from strapdown.estimation.setup.matching import has_states_for as has_states_for
-from strapdown.estimation.setup.matching import specified as specified
-from strapdown.estimation.setup.matching import unmodelled_errors as unmodelled_errors
 from strapdown.estimation.setup.running import at_steps as at_steps
 from strapdown.estimation.setup.running import drawn_state as drawn_state
 from strapdown.estimation.setup.running import initial_state, run, smooth
@@ -39,6 +37,10 @@ from strapdown.estimation.setup.running import run_modelled as run_modelled
 from strapdown.estimation.setup.running import smooth_modelled as smooth_modelled
 from strapdown.estimation.setup.running import with_sigma as with_sigma
 from strapdown.estimation.setup.states import SensorStates, States
+from strapdown.estimation.setup.unmodelled import remedy as remedy
+from strapdown.estimation.setup.unmodelled import specified_errors as specified_errors
+from strapdown.estimation.setup.unmodelled import unmodelled_errors as unmodelled_errors
+from strapdown.estimation.setup.unmodelled import unmodelled_words as unmodelled_words
 
 __all__ = [
     "FilterSetup",

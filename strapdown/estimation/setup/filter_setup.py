@@ -15,6 +15,7 @@ from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import matching
 from strapdown.estimation.setup.states import States
+from strapdown.estimation.setup.unmodelled import specified, specified_errors
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
 from strapdown.records import Estimate, ImuRecord, Origin
@@ -205,12 +206,9 @@ class FilterSetup(ByValue):
             attitude_sigma=matching.linear_sigma(record) if attitude_sigma is None else attitude_sigma,
             bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
         )
-        sensors, gravity_f = matching.specified(origin)
-        if states is False or (
-            states is None
-            and not (origin.gyro and matching.unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
-        ):
+        if states is False or (states is None and not specified_errors(origin)):
             return plain
+        sensors, gravity_f = specified(origin)
         kept, white = matching.matched(
             spec, record, sensors, np.asarray(gravity_f), matching.measurement_density(record)
         )

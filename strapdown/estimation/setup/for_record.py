@@ -1,4 +1,4 @@
-"""The filter for a record from the specifications in the record: the setup that matches its origin, and the initial state."""
+"""The initial state of a filter for a record."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from strapdown import estimation
 from strapdown.checks import Hint, InputError
 from strapdown.estimation import multiple_model, setup
-from strapdown.estimation.filters import MEKF
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
 from strapdown.records import ImuRecord, Origin
@@ -20,48 +19,6 @@ UNEVEN = 2.0
 """Ratio of the largest to the smallest σ of an attitude above which both are reported."""
 
 REMEDY = f"give the initial attitude, {Hint('initial')}"
-
-
-def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -> tuple[str, ...]:
-    """Return, as texts, the errors that an origin specifies and a filter has no state for; empty if nothing is specified."""
-    if origin is None or origin.gyro is None or filter_setup is None:
-        return ()
-    sensors, gravity_f = setup.specified(origin)
-    missing = setup.unmodelled_errors(
-        origin.gyro, sensors, filter_setup.states, gravity_f=gravity_f, rejects=filter_setup.rejects
-    )
-    saturation = "" if origin.scenario is None else origin.scenario.saturation
-    return (*missing, saturation) if saturation else missing
-
-
-DIFFERENT_AXES = 1.2
-"""Ratio of the noises of two axes of a gyro above which it is reported that a filter has only one for all axes."""
-_NOISES = {
-    "angle_random_walk": "angle random walk",
-    "rate_random_walk": "rate random walk",
-    "bias_instability": "bias instability",
-    "markov_noise": "first-order noise",
-}
-
-
-def unequal_axes(origin: Origin | None, filter_setup: FilterSetup | None) -> tuple[str, ...]:
-    """Return a text, or none, on how pessimistic a filter with the noise of a gyro's noisiest axis is about the others."""
-    if origin is None or origin.gyro is None or filter_setup is None or filter_setup.estimator != MEKF:
-        return ()
-    spec, assumed = origin.gyro, filter_setup.process_noise
-    if any(value < 0.99 * np.max(getattr(spec, name)) for name, value in vars(assumed).items()):
-        return ()  # a filter of one's own, with the noise of a quieter axis
-    differ = []
-    for name, words in _NOISES.items():
-        values = np.broadcast_to(getattr(spec, name), 3)
-        if values.max() > DIFFERENT_AXES * values.min():
-            differ.append(f"{words} ×{values.max() / values.min():.3g}" if values.min() > 0.0 else f"{words} ×∞")
-    if not differ:
-        return ()
-    return (
-        f"the gyro's axes differ ({', '.join(differ)}) and the filter has the noise of the noisiest for all: its σ about the others are "
-        "too large, by at most these factors",
-    )
 
 
 class Start(NamedTuple):

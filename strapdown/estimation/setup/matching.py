@@ -12,7 +12,7 @@ from strapdown.checks import Array, InputError, are_finite
 from strapdown.estimation.forward import strength
 from strapdown.estimation.setup.states import Entries, SensorStates, States
 from strapdown.gyro import GyroSpec, flicker
-from strapdown.records import ImuRecord, Origin
+from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
@@ -158,12 +158,6 @@ def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
     )
 
 
-def specified(origin: Origin) -> tuple[Sequence[Any], Sequence[float]]:
-    """Return the sensors with their specified errors, and gravity in the fixed frame, if known."""
-    scenario = origin.scenario
-    return ((), vectors.GRAVITY_F) if scenario is None else (scenario.sensors, scenario.gravity_f)
-
-
 def noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
     """Return the two noises of a filter that has drifts as states; ``white`` is the PSD of flicker above their bandwidth, rad²/s."""
     walk = np.max(np.square(spec.rate_random_walk))
@@ -187,76 +181,6 @@ def commutes_badly(record: ImuRecord, white: float) -> bool:
     length = float(record.time[-1] - record.time[0])
     drift = float(np.linalg.norm(quaternion.rotation_between(one_sample, other))) / length
     return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
-
-
-def unmodelled_errors(
-    spec: GyroSpec,
-    sensors: Sequence[Any] = (),
-    states: States | None = None,
-    *,
-    gravity_f: Sequence[float] = vectors.GRAVITY_F,
-    rejects: bool = False,
-) -> tuple[str, ...]:
-    """Return the specified errors of gyro and sensors for which a filter has no state, as texts with their size.
-
-    If there are any, the covariance of a filter that models only the noise is too small. With ``rejects``, the
-    filter has a gate or robust weights, and outliers are left out.
-
-    Examples
-    --------
-    >>> from strapdown import GyroSpec
-    >>> from strapdown.estimation import setup
-    >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
-    ("the gyro's scale factor of 100 ppm",)
-    """
-    known = () if states is None else states.names
-    errors = _specified_errors(spec, sensors, gravity_f, rejects)
-    return tuple(words for state, words in errors if state not in known)
-
-
-def has_states_for(spec: GyroSpec, sensors: Sequence[Any], gravity_f: Sequence[float]) -> bool:
-    """Return whether there are states for any of the specified errors."""
-    return any(state for state, _ in _specified_errors(spec, sensors, gravity_f, False))
-
-
-def _specified_errors(
-    spec: GyroSpec, sensors: Sequence[Any], gravity_f: Sequence[float], rejects: bool
-) -> list[tuple[str, str]]:
-    """Return the name of the state, empty if there is none, and the words for each specified error."""
-    scale, asymmetry, misalignment, flicker, ramp = (
-        float(np.max(np.abs(getattr(spec, name))))
-        for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability", "rate_ramp")
-    )
-    terms: list[tuple[Any, str, str]] = [
-        (scale, "gyro.scale", f"the gyro's scale factor of {scale / 1e-6:.3g} ppm"),
-        (asymmetry, "", f"the gyro's asymmetry of {asymmetry / 1e-6:.3g} ppm"),
-        (misalignment, "gyro.misalignment", f"the gyro's misalignment of {misalignment / 1e-3:.3g} mrad"),
-        (
-            flicker,
-            "gyro.drift",
-            f"the gyro's flicker of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias",
-        ),
-        (np.any(gravity_f) * spec.g_sensitivity, "gyro.force", "the gyro's sensitivity to acceleration"),
-        (spec.temperature is not None, "gyro.temperature", "the gyro's bias over temperature"),
-        (np.max(spec.quantization) + np.max(spec.rate_resolution), "", "the gyro's quantisation"),
-        (ramp, "", f"the gyro's rate ramp of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²"),
-        (np.isfinite(spec.bandwidth), "", f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz"),
-        (spec.timestamp_offset, "", f"the gyro's time stamps, late by {spec.timestamp_offset:.3g} s"),
-        (spec.timestamp_error + spec.sampling_jitter, "", "the gyro's irregular sampling or time stamps"),
-    ]
-    for sensor in sensors:
-        name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
-        accelerated = getattr(sensor, "acceleration_f", None) is not None
-        terms += [
-            (getattr(sensor, "hard_iron", 0.0), f"{name}.bias", f"the hard iron of the {name}"),
-            (getattr(sensor, "soft_iron", 0.0), "", f"the soft iron of the {name}"),
-            (getattr(sensor, "bias", 0.0), f"{name}.bias", f"the bias of the {name}"),
-            (getattr(sensor, "lever_arm_b", 0.0), f"{name}.lever", f"the accelerations of the {name} at its lever arm"),
-            (accelerated, f"{name}.velocity", f"the acceleration of the point where the {name} is mounted"),
-            (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
-            (not rejects and faults.outlier_probability, "", f"the outliers of the {name} (a gate rejects them)"),
-        ]
-    return [(state, words) for size, state, words in terms if np.any(size)]
 
 
 def linear_sigma(record: ImuRecord) -> float:
