@@ -623,6 +623,16 @@ def test_what_is_left_out_or_beyond_linear_is_reported():
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
 
 
+def test_a_lever_arm_is_analysed_whatever_the_errors_of_the_time_stamps():
+    """They are left out, so the result is that without them; with an early clock the record ended before its last measurements."""
+    scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
+    belief = setup.FilterSetup.for_scenario(scenario)
+    early = dataclasses.replace(scenario.gyro, timestamp_offset=-0.01, drop_probability=0.1)
+    early = covariance.analyse(dataclasses.replace(scenario, gyro=early, gyro_preset=""), belief, epochs=2)
+    np.testing.assert_array_equal(early.rms, covariance.analyse(scenario, belief, epochs=2).rms)
+    assert early.left_out[-1] == "the gyro's lost samples"
+
+
 def test_what_is_considered_too_large_is_reported():
     scenario = white("spin", 10.0)
     for considered, word in (

@@ -157,7 +157,12 @@ def trajectory_of(scenario: Scenario, setup: FilterSetup, epochs: int) -> Trajec
     problem = dataclasses.replace(problem, model=assemble(problem.error_states, kinds, isotropic=False))
     if problem.model.levers.any():
         # The angular acceleration is that of a run: how much it is smoothed depends on the gyro's noise.
-        motion = measured_motion(modelled_record(scenarios.simulate(scenario), setup), setup)
+        # Errors of the time stamps are left out.
+        gyro = dataclasses.replace(
+            scenario.gyro, timestamp_offset=0.0, timestamp_error=0.0, sampling_jitter=0.0, drop_probability=0.0
+        )
+        on_time = scenarios.simulate(dataclasses.replace(scenario, gyro=gyro))
+        motion = measured_motion(modelled_record(on_time, setup), setup)
         problem = dataclasses.replace(problem, motion=motion)
     every = steps // epochs * samples
     return Trajectory(
