@@ -287,14 +287,31 @@ def increasing(name: str, time: ArrayLike, *, minimum: int = 1) -> Array:
     stamps = array(name, time, ("n",))
     if len(stamps) < minimum:
         raise InputError(f"{name} has {len(stamps)} stamps; at least {minimum} are needed")
-    steps = np.diff(stamps)
-    if np.any(steps <= 0.0):
-        k = int(np.argmax(steps <= 0.0))
-        what = "repeats" if steps[k] == 0.0 else "goes back to"
-        raise InputError(
-            f"{name}[{k + 1}] {what} {stamps[k + 1]:.9g} s after {stamps[k]:.9g} s; sort the stamps and drop repeated ones"
-        )
+    not_back(name, stamps)
+    if np.any(same := np.diff(stamps) == 0.0):
+        k = int(np.argmax(same)) + 1
+        raise InputError(f"{name}[{k}] repeats {stamps[k]:.9g} s; drop repeated stamps")
     return stamps
+
+
+def not_back(name: str, stamps: Array) -> None:
+    """Raise an error for a stamp, s, before that of the row before."""
+    if np.any(back := np.diff(stamps) < 0.0):
+        k = int(np.argmax(back)) + 1
+        remedy = order_remedy(stamps, k, k + 1)
+        raise InputError(f"{name}[{k}] goes back to {stamps[k]:.9g} s after {stamps[k - 1]:.9g} s; {remedy}")
+
+
+def order_remedy(stamps: NDArray[Any], k: int, row: int) -> str:
+    """Return the remedy for a stamp k, of the row of that number in the source, that is not after the one before.
+
+    If it lies more than half of the time before, and ten steps, the clock restarted: sorted stamps would mix the samples of two recordings.
+    """
+    steps = np.diff(stamps)
+    back = -steps[k - 1]
+    if back > 0.5 * (stamps[k - 1] - stamps[0]) and back > 10.0 * np.median(np.abs(steps)):
+        return f"the clock restarted in row {row}: split the recording there"
+    return "sort the rows and drop repeated ones, or check the time's unit"
 
 
 def is_definite(matrix: Array) -> bool:

@@ -131,6 +131,13 @@ def test_a_repeated_time_of_a_trajectory_is_refused(tmp_path):
     tum = tmp_path / "walk.tum"
     tum.write_text("1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n")
     refused(tum, "data row 2 is not after the one before", trajectories.read_tum)
+    times = [*range(40), *range(9)]
+    tum.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in times))
+    restarted = "row 41 is not after the one before; the clock restarted in row 41: split the recording there"
+    refused(tum, restarted, trajectories.read_tum)
+    table = tmp_path / "walk.csv"
+    table.write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{k},1,0,0,0\n" for k in times))
+    refused(table, restarted, attitudes.read_attitudes)
 
 
 # ------------------------------------------------------------------------------------------------------------------ interruption

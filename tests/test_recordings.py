@@ -137,6 +137,17 @@ REFUSED = {
     "hardly a sample": (HEADER, [ROWS[0], SECOND.replace("0.5", "")], "1 of 2 rows have a whole gyro sample", "at least 2"),
     "gap and back": (HEADER, [ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]], "time[2] goes back to 0.01 s"),
     "back": (HEADER, [ROWS[0], ROWS[2], ROWS[1]], "time[2] goes back to 0.01 s", "sort"),
+    "clock restarted": (
+        HEADER,
+        [f"{0.01 * (k % 120) + (0.3 if k < 120 else 0.0)},{0.1 * k},0,0,0,0,9" for k in range(200)],
+        "time[120] goes back to 0 s after 1.49 s",
+        "the clock restarted in row 121: split the recording there",
+    ),
+    "clock restarted after a repeated row": (
+        HEADER,
+        [ROWS[0], *(f"{0.01 * (k % 50)},{0.1 * k},0,0,0,0,9" for k in range(70))],
+        "the clock restarted in row 52: split",
+    ),
     "clock set": (HEADER, [*ROWS[:3], "1.7e9,0,0,0,0,0,9"], "time[3] jumps to 1.7e+09 s after 0.02 s", "cut"),
     "no row": (HEADER, [], "no data rows"),
     "one row": (HEADER, ROWS[:1], "time has 1 stamps"),

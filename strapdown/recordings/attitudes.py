@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, Hint, InputError, are_finite, array
+from strapdown.checks import Array, Hint, InputError, are_finite, array, order_remedy
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, outputs, result_files
@@ -254,8 +254,9 @@ def _table(path: Path) -> Attitudes:
         bias = None  # its covariance is not given
     back = np.diff(stamps[rows]) <= 0
     if back.any():
-        row = rows[1:][back][0] + 1
-        raise InputError(f"{path.name}: row {row} is not after the one before; sort the rows, or check the time's unit")
+        k = int(np.argmax(back)) + 1
+        remedy = order_remedy(stamps[rows], k, row := int(rows[k]) + 1)
+        raise InputError(f"{path.name}: row {row} is not after the one before; {remedy}")
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[rows],

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, InputError, array, order_remedy
 from strapdown.files import atomic_write, reading
 from strapdown.recordings.delimited import is_number, read_csv
 from strapdown.records import Estimate
@@ -101,7 +101,9 @@ def _table(path: Path, separator: str | None, tick: int) -> tuple[NDArray[np.int
         stamps[k] = int(Decimal(time) * tick)
     back = np.diff(stamps) <= 0
     if back.any():
-        raise InputError(f"{path.name}: data row {np.argmax(back) + 2} is not after the one before; sort the rows")
+        k = int(np.argmax(back)) + 1
+        remedy = order_remedy(stamps, k, k + 1)
+        raise InputError(f"{path.name}: data row {k + 1} is not after the one before; {remedy}")
     return stamps, rows
 
 

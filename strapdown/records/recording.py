@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, increasing, median, one_of
+from strapdown.checks import Array, InputError, array, increasing, median, not_back, one_of
 from strapdown.results import Listed, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -232,6 +232,7 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
 
     A log may have a row for each sensor: vectors and temperatures in rows without the gyro go to the nearest row with it that lacks them.
     """
+    not_back(f"{source}: time", time)  # before rows are left out
     same = np.diff(time) == 0.0
     columns |= {"time": time, "rate": rate}
     if same.any() and np.mean(same) >= FEW_REPEATED:
