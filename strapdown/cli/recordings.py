@@ -81,8 +81,4 @@ def convert(
         content = sd.recordings.with_reference(content, reference)
     sd.write(content, target)
     ui.show(content.listing())
-    if not estimate:
-        stored = (*content.parts, *(["clock"] if content.epoch_ns else []))
-        lost = [name for name in sd.recordings.not_held(target) if name in stored]
-        ui.say(f"{target.name} cannot store {', '.join(lost)}: omitted." if lost else "")
     ui.written(target)

@@ -28,7 +28,6 @@ from strapdown.recordings.formats import (
     estimate_format,
     format_of,
     from_record,
-    not_held,
     read,
     write,
     writers,

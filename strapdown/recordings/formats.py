@@ -7,6 +7,7 @@ files of a folder. A file of unknown content is read according to its extension,
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,14 @@ from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord, outputs
 from strapdown.records.recording import Recording, matched, with_gyro
 
+ALL = (".csv", ".tsv", ".parquet")
+"""Endings of the formats that store everything."""
 HEAD = 4096
 """Number of bytes at the start of a file from which its format is recognised."""
+
+
+class OmissionWarning(UserWarning):
+    """A format cannot store a part of a recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +219,14 @@ def write(
             options["recording"] = recording
         file_format.write_estimate(content, Path(path), **options)
     else:
-        _by_ending(path, "write").write(content, Path(path), **options)
+        file_format = _by_ending(path, "write")
+        file_format.write(content, Path(path), **options)
+        stored = (*content.parts, *(["clock"] if content.epoch_ns else []))
+        if lost := [name for name in file_format.lacks if name in stored]:
+            words = (
+                f"{Path(path).name} ({file_format.name}) cannot store {', '.join(lost)}: omitted; {', '.join(ALL)} can"
+            )
+            warnings.warn(words, OmissionWarning, stacklevel=3)
 
 
 def estimate_format(
@@ -287,8 +301,3 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
         remarks=tuple(remarks),
         **own,
     )
-
-
-def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return the contents of a recording that the format of a path's extension cannot store."""
-    return _by_ending(path, "write").lacks
