@@ -117,9 +117,9 @@ def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds,
     assert 0.0 < errors["bias"]["rms_deg_per_h"] < 3.0 * errors["bias"]["sigma_deg_per_h"]
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         assert np.array_equal(file["truth/attitude"][:], truth.attitude)
-    for command in ("estimate", "tune"):
+    for command, out in (("estimate", "2"), ("tune", "2.toml")):
         assert "a result, not a recording" in refusal(
-            command, tmp_path / "out" / "estimate.h5", "--out", tmp_path / "2.toml"
+            command, tmp_path / "out" / "estimate.h5", "--out", tmp_path / out
         )
 
 
@@ -182,6 +182,14 @@ def test_what_does_not_go_together_or_is_missing_is_refused(refusal, files, tmp_
     shutil.copy(files / "filter.toml", tmp_path)
     assert words in refusal("estimate", files / name, "--out", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_is_not_named_like_a_file(refusal, run, record, tmp_path):
+    said = refusal("estimate", record, "--out", tmp_path / "x.h5")
+    assert "x.h5, but a folder is meant, for estimate.h5; name one without a suffix: " in said
+    assert not (tmp_path / "x.h5").exists()
+    (tmp_path / "x.h5").mkdir()
+    assert run("estimate", record, "--out", tmp_path / "x.h5")[0] == 0
 
 
 @pytest.mark.parametrize("sensors", [STARS, HAND, TRACKER], ids=["directions", "vertical and heading", "attitude"])

@@ -121,6 +121,26 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
             node.attrs[name] = value
 
 
+FILES = (
+    ".h5",
+    ".hdf5",
+    ".json",
+    ".toml",
+    ".html",
+    ".csv",
+    ".tsv",
+    ".parquet",
+    ".tum",
+    ".bag",
+    ".mcap",
+    ".db3",
+    ".png",
+    ".pdf",
+    ".svg",
+)
+"""Suffixes that the name of a new folder must not have: a file was meant."""
+
+
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
     """Reject a folder to which results cannot be written, before they are computed: one below a file, or without permission."""
     place = Path(folder).absolute()
@@ -140,9 +160,15 @@ def writable(
 ) -> None:
     """Reject output files that cannot be written, before anything is computed.
 
-    A folder in the place of a file, a suffix that is not in ``suffixes``, or a file that is one of the ``sources`` that are read.
+    A folder in the place of a file, a new folder named like a file, a suffix that is not in ``suffixes``, or a file that is one of the
+    ``sources`` that are read.
     """
     for target in map(Path, paths):
+        folder = target.parent
+        if folder.suffix.lower() in FILES and not folder.exists():
+            raise InputError(
+                f"{name} is {folder}, but a folder is meant, for {target.name}; name one without a suffix: {folder.with_suffix('')}"
+            )
         if target.is_dir():
             raise InputError(f"{name}: {target} is a folder, but a file of that name must be written; choose another")
         if suffixes and target.suffix.lower() not in suffixes:
