@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from spin_plan import PLAN
 from two_stars import stars
 
 from benchmarks import power
 from strapdown import consistency, estimation, montecarlo, motion, scenarios, units, vectors
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
+from strapdown.montecarlo import scalar, statistics
 from strapdown.records import Truth
 
 
@@ -66,6 +68,27 @@ def test_autocorrelation_bounds_hold():
         jointly += np.any(np.abs(correlation.values[:, 0]) > correlation.simultaneous_bounds)
     assert abs(outside / 20_000 - 0.05) < 0.007
     assert abs(jointly / 2000 - 0.05) < 0.02
+
+
+def test_no_run_of_right_filters_is_beyond_chance(monkeypatch):
+    """The bound holds for independent epochs, its worst case, and for a few runs, where the mean of the others scatters."""
+    random = np.random.default_rng(5)
+    one = scalar.run_chunk(PLAN, 0, 1)
+    for runs in (3, 48):
+        nees = random.chisquare(6, (2000, runs, len(one.time)))
+        named = {0.05: 0, 1e-4: 0}
+        for campaign in nees:
+            run, score = statistics.worst(np.arange(runs), campaign.max(axis=1))
+            sums = np.repeat(campaign.sum(axis=0)[:, None], 3, axis=1)
+            total = replace(
+                one, runs=runs, finite=runs + 0 * one.finite, nees_sum=sums, worst_run=run, worst_score=score
+            )
+            for level in named:
+                monkeypatch.setattr(statistics, "ODD", level)
+                named[level] += bool(statistics._odd_runs(total))
+        assert named[1e-4] <= 2
+        assert named[0.05] <= 100 + 3.0 * np.sqrt(95.0)
+    assert named[0.05] > 0  # conservative, not idle
 
 
 @pytest.mark.slow

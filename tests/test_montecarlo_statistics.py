@@ -174,6 +174,33 @@ def test_worst_runs_are_the_largest_and_of_equal_ones_the_first():
     assert run.tolist() == [3, 9]
 
 
+def with_score(total, factor, run, score):
+    """Statistics in which all NEES are larger by a factor, and one run has a NEES at one epoch."""
+    nees = factor * total.nees_sum
+    nees[3] += [score, 0.5 * score, 0.5 * score]
+    worst = statistics.worst(np.append(total.worst_run, run), np.append(factor * total.worst_score, score))
+    return replace(total, nees_sum=nees, worst_run=worst[0], worst_score=worst[1])
+
+
+def test_a_run_beyond_all_chance_is_named_in_the_verdict():
+    """Its share of the mean of 48 runs, which alone was tested, is small at an epoch that is not among those tested."""
+    total, six = (replace(scalar.run_chunk(PLAN, 0, runs), plan=PLAN) for runs in (48, 6))
+    for few in (total, six):
+        assert "beyond all chance" not in few.judge().reason
+        judged = with_score(few, 1.0, 117, 214.0).judge(epochs=[1, 6])
+        assert judged.verdict == "not consistent"
+        assert f"run 117 (NEES 214) of seed {PLAN.seed} beyond all chance (p < 0.0001" in judged.reason
+    assert not judged.findings[0].rejected
+    assert (
+        "run 117 (NEES 214), run 3 (NEES"
+        in with_score(with_score(total, 1.0, 3, 190.0), 1.0, 117, 214.0).judge().reason
+    )
+    # Of a filter whose errors are three times its σ in every run, this is an ordinary one.
+    optimistic = with_score(total, 9.0, 117, 214.0).judge()
+    assert optimistic.verdict == "not consistent"
+    assert "beyond all chance" not in optimistic.reason
+
+
 def test_a_run_that_fails_is_counted_reported_and_left_out(monkeypatch):
     """One run of five turns to NaN half way: sums go on without it, the verdict does not."""
     original = setups.run

@@ -38,6 +38,9 @@ EXAMPLES = 8
 WORST = 10
 """Number of worst runs that are recorded."""
 
+ODD = 1e-4
+"""Probability, over all runs and epochs of a consistent filter, of a NEES that contradicts it alone."""
+
 BINS_PER_OCTAVE = 8
 """Histogram bins of equal width between a number and its double: 12.5 to 6.7 % of the value."""
 OCTAVES = 43
@@ -202,7 +205,7 @@ class Statistics(ByValue, Listed):
                 findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
         parts = [f"{INNOVATIONS}{finding.of}" for finding in findings if finding.name == "NIS"]
         parts += [name for name in STATES if name in self.subsets]
-        return concluded(
+        judged = concluded(
             findings,
             [],
             confidence_level,
@@ -211,6 +214,12 @@ class Statistics(ByValue, Listed):
             unmodelled=() if self.plan is None else self.plan.unmodelled,
             runs=f"{self.runs} runs",
         )
+        if not (what := _odd_runs(self)):
+            return judged
+        reason = (
+            f"{judged.reason}; {what}" if judged.verdict == "not consistent" else f"{what}; otherwise {judged.headline}"
+        )
+        return replace(judged, verdict="not consistent", reason=reason)
 
     def listing(self) -> Table:
         """Return the evidence of the verdict as a table, with the errors at the end as its notes."""
@@ -506,6 +515,25 @@ def _run_coverage(statistics: Statistics, epochs: Counts) -> Finding:
         samples=statistics.runs,
         means=f"{100.0 * value:.3g} % of the {name} errors lie within {k + 1} σ at the worst epoch",
     )
+
+
+def _odd_runs(statistics: Statistics) -> str:
+    """Return the runs whose largest NEES no consistent filter has, by number and seed; empty if there are none.
+
+    The p-value is Bonferroni's over all runs and epochs, by the χ² tail of the NEES, divided by the mean of the other runs at its worst
+    epoch if that is above 1: where all σ are too small, or the tail is heavier because the filter is linearised, no single run is to blame.
+    """
+    from scipy.special import chdtrc
+
+    column, degrees = SUBSETS[statistics.subsets[0]]
+    score = statistics.worst_score[np.isfinite(statistics.worst_score), None]
+    others = (statistics.nees_sum[:, column] - score) / (degrees * np.maximum(statistics.finite - 1, 1))
+    relative = score[:, 0] / others.max(axis=1, initial=1.0)
+    odd = statistics.runs * len(statistics.time) * chdtrc(degrees, relative) < ODD
+    runs = zip(statistics.worst_run[np.isfinite(statistics.worst_score)][odd], score[odd, 0], strict=True)
+    names = ", ".join(f"run {run} (NEES {figure(float(value), 3)})" for run, value in runs)
+    seed = "" if statistics.plan is None else f" of seed {statistics.plan.seed}"
+    return f"{names}{seed} beyond all chance (p < {ODD:g} over all runs and epochs)" if names else ""
 
 
 def _divided(total: Any, number: Any) -> Array:
