@@ -363,6 +363,23 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     assert saved == json.loads(json.dumps(explanation.summary()))
 
 
+def test_what_is_specified_is_known_and_not_likely():
+    """The data do not distinguish a scale factor in a constant rotation from an initial bias; the specification does."""
+    spin = scenarios.load_scenario("spin")
+    spin = replace(spin, gyro=replace(spin.gyro, scale_factor=np.full(3, 3e-3)), gyro_preset="")
+    record = sd.simulate(spin, seed=3)
+    found, _ = sd.diagnose(sd.estimate(record, states=False), record)
+    assert found.cause_words.startswith("Known, as specified: the gyro's scale factor is in error by [")
+    marks = {(row[0], row[1]): row[-1] for row in found.listing().rows}
+    assert marks["scale factor", "gyro"] == "known"
+    assert marks["initial bias", "start"] == "likely"
+    assert [cause.name for cause in found.causes if cause.known] == ["scale factor"]
+    silent = replace(record, origin=None)
+    unknown, _ = sd.diagnose(replace(sd.estimate(record, states=False), origin=None), silent)
+    assert not any(cause.known for cause in unknown.considered)
+    assert "One of these causes, which the data do not distinguish" in unknown.cause_words
+
+
 # ------------------------------------------------------------------------------------------------------------- one of these causes
 
 

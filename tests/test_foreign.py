@@ -13,6 +13,7 @@ from measured import waves
 from scipy.spatial.transform import Rotation
 from ulog_writer import message as ulog_message
 
+import strapdown as sd
 from sims import peer_judged
 from strapdown import consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
 from strapdown.checks import InputError
@@ -845,3 +846,31 @@ def test_the_heading_gradient_of_the_sim_is_the_derivative():
         turned = quaternion.multiply(q, quaternion.exp(1e-6 * np.eye(3)))
         difference = (euler(turned).angles[:, 0] - euler(q[None]).angles[0, 0]) / 1e-6
         np.testing.assert_allclose(peer_judged.heading_gradient(q), difference, atol=1e-5)
+
+
+def test_an_estimate_of_this_package_is_judged_with_its_specification(tmp_path):
+    """With its record as the truth, the verdict names what the filter does not model, as it does without."""
+    spin = replace(scenarios.load_scenario("spin"), duration=60.0)
+    late = replace(spin.gyro, scale_factor=np.full(3, 1e-4), timestamp_offset=0.02)
+    record = sd.simulate(replace(spin, gyro=late, gyro_preset=""), seed=3)
+    result = sd.estimate(record, states=False)
+    sd.write(record, tmp_path / "record.h5")
+    sd.write(result, tmp_path / "estimate.h5")
+    own, truth = (read_attitudes(tmp_path / name) for name in ("estimate.h5", "record.h5"))
+    checked = consistency.check_attitudes(own, truth)
+    assert checked.judgement.unmodelled == sd.check(result).unmodelled
+    assert len(checked.judgement.unmodelled) == 2
+    assert [explanation.name for explanation in checked.explanations if explanation.known] == [foreign.CLOCK]
+
+
+def test_upper_bounds_are_known_to_be_too_large():
+    random = np.random.default_rng(1)
+    time = np.arange(1000.0)
+    attitude = quaternion.exp(np.cumsum(0.1 * random.standard_normal((1000, 3)), axis=0) % 2.0)
+    estimate = quaternion.multiply(attitude, quaternion.exp(0.01 * random.standard_normal((1000, 3))))
+    truth = Attitudes.from_arrays(time, attitude)
+    for motion, factor, mark in (("hand", 9.0, "known"), ("", 9.0, "likely"), ("hand", 0.1, "likely")):
+        P = np.tile(factor * 1e-4 * np.eye(3), (1000, 1, 1))
+        own = Attitudes.from_arrays(time, estimate, covariance=P, motion=motion)
+        marks = {row[0]: row[-1] for row in consistency.check_attitudes(own, truth).listing().rows}
+        assert marks[foreign.SCALE] == mark

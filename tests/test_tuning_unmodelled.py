@@ -185,7 +185,10 @@ def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     assert unmodelled.causes
     assert unmodelled.causes[0].name == "hard iron"
     assert not unmodelled.moves_with_the_rate
-    assert any("Most likely cause" in words for words in unmodelled.words)
+    assert any(words.startswith("Known, as specified: magnetometer has a hard iron") for words in unmodelled.words)
+    silent = dataclasses.replace(case, record=dataclasses.replace(case.record, origin=None))
+    unmodelled = tuning.unmodelled(silent, filter_setup)
+    assert any("Most likely cause: magnetometer has a hard iron" in words for words in unmodelled.words)
 
 
 def test_the_command_reports_it_and_refuses_two_kinds(succeeds, refusal, tmp_path):

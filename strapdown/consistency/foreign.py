@@ -30,9 +30,10 @@ from strapdown.consistency.alignment import (
     turns,
 )
 from strapdown.consistency.bounds import mean_p_value
-from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge
+from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge, mark
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
+from strapdown.estimation.setup import LATE, from_toml
 from strapdown.records import Estimate, Innovations, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
@@ -47,6 +48,7 @@ poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
 SCALE = "σ wrong by one factor"
+CLOCK = "offset of the clock, delay"
 NO_BIAS = "gyro bias held at zero"
 
 
@@ -62,6 +64,8 @@ class Explanation:
     """Probability of as large a reduction by chance for a consistent filter; small if the explanation is likely."""
     likely: bool = False
     """Whether so large a reduction is improbable by chance, all explanations together (Holm)."""
+    known: bool = False
+    """Whether the verdict itself names it: σ that are upper bounds are too large, and the gyro's stamps are specified to be late."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +109,7 @@ class Checked:
 
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
-        rows = [(e.name, e.value, e.nees, e.p_value, "likely" if e.likely else "no") for e in self.explanations]
+        rows = [(e.name, e.value, e.nees, e.p_value, mark(e.likely, e.known)) for e in self.explanations]
         columns = ("cause", "size", "NEES then", Column("p-value", digits=2), "")
         return Table("Possible causes of the attitude errors", columns, rows, left=2)
 
@@ -221,9 +225,20 @@ def check_attitudes(
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
     estimate = replace(estimate, truth=true, motion=own.motion, remarks=tuple(f"Note: {words}." for words in remarks))
-    estimate = replace(estimate, origin=Origin(source=own.source), details={"truth": truth.source})
+    estimate = replace(
+        estimate,
+        setup=from_toml(own.filter, f"{own.source}: filter") if own.filter else None,
+        origin=replace(own.origin or Origin(), source=own.source, epoch_ns=0),
+        details={"truth": truth.source},
+    )
+    judgement = judge(estimate, **how)
+    late = any(what.startswith(LATE) for what in judgement.unmodelled)
+    explained = tuple(
+        replace(e, known=late if e.name == CLOCK else e.name == SCALE and bool(own.motion) and float(e.value) < 1.0)
+        for e in explained
+    )
     return Checked(
-        judgement=judge(estimate, **how),
+        judgement=judgement,
         estimate=estimate,
         alignment=alignment,
         error_frame=frame,
@@ -344,7 +359,7 @@ def _constant_differences(error: Array, P: Array, derivatives: Array) -> Iterato
     designs = {
         "fixed frame rotated (heading, gravity)": derivatives[:, :, :3],
         "body frame rotated (mounting)": derivatives[:, :, 3:6],
-        "offset of the clock, delay": derivatives[:, :, 6:],
+        CLOCK: derivatives[:, :, 6:],
     }
     for name, J in designs.items():
         A = np.linalg.solve(factor, J)

@@ -572,6 +572,11 @@ def holm(p_values: Sequence[float], error: float) -> list[bool]:
     return rejected
 
 
+def mark(is_likely: bool, is_known: bool) -> str:
+    """Return what a table says of a cause: an error that is specified, or of which the filter's σ are bounds, is known, not likely."""
+    return "no" if not is_likely else "known" if is_known else "likely"
+
+
 def state_name(state: int) -> str:
     """Return the name, "attitude x" … "bias z", of a state by its index."""
     return f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}"

@@ -26,7 +26,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, are_finite, array, order_remedy
 from strapdown.files import reading
 from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
-from strapdown.records import Innovations, outputs, result_files
+from strapdown.records import Innovations, Origin, outputs, result_files
 from strapdown.records.estimate import STATES
 from strapdown.records.recording import TIME_UNITS, whole_ns
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -57,6 +57,10 @@ class Attitudes:
     motion : str, default ""
         Model of the motion, if the attitudes are an estimate of this package for a recording: its σ are then upper bounds
         (:class:`strapdown.records.Estimate`); a table states only that they are.
+    origin : Origin, optional
+        Origin of an estimate of this package, with what is specified of gyro and sensors.
+    filter : str, default ""
+        The filter of such an estimate, as TOML.
     remarks : tuple of str, default empty
         Choices of the reader.
     """
@@ -70,6 +74,8 @@ class Attitudes:
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     movement: NDArray[np.bool_] | None = None
     motion: str = ""
+    origin: Origin | None = None
+    filter: str = ""
     remarks: tuple[str, ...] = ()
 
     @classmethod
@@ -185,6 +191,8 @@ def _own(path: Path, kind: str) -> Attitudes:
             bias=None if bias is None else bias[known],
             innovations={k: replace(series, time=series.time - time[0]) for k, series in innovations.items()},
             motion=str(attributes.get("motion", "")),
+            origin=recordfiles.origin_of(attributes, path),
+            filter=str(attributes.get("filter", "")),
         )
     if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)

@@ -101,7 +101,7 @@ class Unmodelled:
         if left > 0:
             sentences.append(f"And {left} more of {len(self.judgement.findings)} tests contradict the tuned filter.")
         if self.causes:
-            sentences.append(f"Most likely cause: {self.causes[0].words}.")
+            sentences.append(f"{self.causes[0].sentence}.")
         return (*sentences, *self.remarks)
 
     def summary(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from strapdown.records import Origin
 if TYPE_CHECKING:
     from strapdown.estimation.setup.filter_setup import FilterSetup
 
+LATE = "the gyro's time stamps, late"
 REJECTION = "gate or robust weights"
 DIFFERENT_AXES = 1.2
 """Ratio of the noises of two axes of a gyro above which it is reported that a filter has only one for all axes."""
@@ -100,7 +101,6 @@ def _of_gyro(spec: GyroSpec, gravity_f: Sequence[float]) -> list[tuple[Any, Spec
         for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability", "rate_ramp")
     )
     drift = f"flicker of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias"
-    late = f"time stamps, late by {spec.timestamp_offset:.3g} s"
     terms: list[tuple[Any, str, str, bool]] = [
         (scale, f"scale factor of {scale / 1e-6:.3g} ppm", "gyro.scale", True),
         (asymmetry, f"asymmetry of {asymmetry / 1e-6:.3g} ppm", "", True),
@@ -110,13 +110,13 @@ def _of_gyro(spec: GyroSpec, gravity_f: Sequence[float]) -> list[tuple[Any, Spec
         (spec.temperature is not None, "bias over temperature", "gyro.temperature", False),
         (np.max(spec.quantization) + np.max(spec.rate_resolution), "quantisation", "", False),
         (ramp, f"rate ramp of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²", "", True),
-        (spec.timestamp_offset, late, "", False),
         (spec.timestamp_error + spec.sampling_jitter, "irregular sampling or time stamps", "", False),
     ]
     lag = SpecifiedError(f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz")
     return [
         *((size, SpecifiedError(f"the gyro's {words}", model, analysed)) for size, words, model, analysed in terms),
         (np.isfinite(spec.bandwidth), lag),
+        (spec.timestamp_offset, SpecifiedError(f"{LATE} by {spec.timestamp_offset:.3g} s", analysed=False)),
     ]
 
 

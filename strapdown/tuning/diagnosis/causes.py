@@ -8,6 +8,7 @@ from typing import Any
 
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
+from strapdown.consistency.judgement import mark
 from strapdown.files import plain
 from strapdown.results import Listed, Table
 
@@ -39,6 +40,8 @@ class Cause:
         Natural logarithm of the probability of as large a gain for a consistent filter.
     words : str
         Description with the size of the fault.
+    known : bool, default False
+        Whether it is specified, and only the filter does not model it.
     """
 
     name: str
@@ -49,6 +52,12 @@ class Cause:
     gain: float
     log_p: float
     words: str
+    known: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The cause as known or as likely."""
+        return f"{'Known, as specified' if self.known else 'Most likely cause'}: {self.words}"
 
     @property
     def finding(self) -> Finding:
@@ -78,7 +87,7 @@ class Diagnosis(Listed):
     def listing(self) -> Table:
         """Return the causes considered, the most likely first, as a table."""
         rows = [
-            (cause.name, cause.of, cause.gain, cause.log_p, "likely" if cause in self.causes else "no")
+            (cause.name, cause.of, cause.gain, cause.log_p, mark(cause in self.causes, cause.known))
             for cause in self.considered[:8]
         ]
         notes = self.words.splitlines()
@@ -86,9 +95,13 @@ class Diagnosis(Listed):
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
-        """The most likely cause, and those that the data do not distinguish from it: within a factor of 20 or 1 % of ln p."""
+        """The most likely cause, and those that the data do not distinguish from it: within a factor of 20 or 1 % of ln p.
+
+        If some of these are known, only they.
+        """
         best = self.causes[0].log_p if self.causes else 0.0
-        return tuple(cause for cause in self.causes if cause.log_p <= best + max(LIKELIER, APPROXIMATION * -best))
+        near = tuple(cause for cause in self.causes if cause.log_p <= best + max(LIKELIER, APPROXIMATION * -best))
+        return tuple(cause for cause in near if cause.known) or near
 
     @property
     def words(self) -> str:
@@ -101,11 +114,14 @@ class Diagnosis(Listed):
         if not self.causes:
             return "No cause among those considered is significant."
         first = self.alternatives
-        lines = [f"Most likely cause: {first[0].words}"]
+        lines = [first[0].sentence]
         if len(first) > 1:
             heading = "One of these causes, which the data do not distinguish:"
             lines = [heading, *(f"  - {cause.words}" for cause in first)]
-        lines += [f"  then, unless a side effect of the first:  {cause.words}" for cause in self.causes[len(first) : 4]]
+        others = [cause for cause in self.causes if cause not in first]
+        lines += [
+            f"  then, unless a side effect of the first:  {cause.words}" for cause in others[: max(4 - len(first), 0)]
+        ]
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from strapdown import coning, consistency, estimation, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
-from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
+from strapdown.estimation.setup import LATE, FilterSetup, modelled_record, need_mekf
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers, shown
@@ -68,13 +68,14 @@ def diagnose(
         raise InputError("record has no vector measurements in its time, so there are no innovations to diagnose from")
     kept = None if truth is None else truth.taken(slice(None, None, every))
     if judgement is None:
-        judgement = consistency.judge(estimate, kept)
+        judgement = consistency.judge(replace(estimate, setup=setup, origin=record.origin), kept)
     base = run(model)
     accurate = modelled_record(record, replace(setup, integration=coning.ALGORITHMS[ACCURATE_ALGORITHM]))
     better = run(replace(model, record=replace(accurate, truth=None))).closer_than(base)
     considered = [*_causes(model, base, estimate), _commutation(record, setup, estimate, kept, better)]
     if max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in measured) > GROSS:
         considered += conventions(model, base)
+    considered = [replace(cause, known=_is_known(cause, judgement.unmodelled)) for cause in considered]
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
     evidence = [*judgement.findings, *(cause.finding for cause in considered)]
     together = consistency.concluded(
@@ -91,6 +92,13 @@ def diagnose(
         considered=tuple(considered),
         judgement=together,
     )
+
+
+def _is_known(cause: Cause, unmodelled: Sequence[str]) -> bool:
+    """Return whether a cause is among the specified errors that a filter does not model, by their words."""
+    of_gyro = LATE if cause.name == "time offset" else f"the gyro's {cause.name}"
+    words = of_gyro if cause.of == "gyro" else f"the {cause.name.removeprefix('body-fixed ')} of the {cause.of}"
+    return any(error.startswith(words) for error in unmodelled)
 
 
 def _causes(model: Model, base: Run, estimate: Estimate) -> Iterator[Cause]:
