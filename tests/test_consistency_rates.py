@@ -73,15 +73,15 @@ def test_autocorrelation_bounds_hold():
 def test_no_run_of_right_filters_is_beyond_chance(monkeypatch):
     """The bound holds for independent epochs, its worst case, and for a few runs, where the mean of the others scatters."""
     random = np.random.default_rng(5)
-    one = scalar.run_chunk(PLAN, 0, 1)
+    plain = scalar.run_chunk(PLAN, 0, 1)
     for runs in (3, 48):
-        nees = random.chisquare(6, (2000, runs, len(one.time)))
+        nees = random.chisquare(6, (2000, runs, len(plain.time)))
         named = {0.05: 0, 1e-4: 0}
         for campaign in nees:
             run, score = statistics.worst(np.arange(runs), campaign.max(axis=1))
             sums = np.repeat(campaign.sum(axis=0)[:, None], 3, axis=1)
             total = replace(
-                one, runs=runs, finite=runs + 0 * one.finite, nees_sum=sums, worst_run=run, worst_score=score
+                plain, runs=runs, finite=runs + 0 * plain.finite, nees_sum=sums, worst_run=run, worst_score=score
             )
             for level in named:
                 monkeypatch.setattr(statistics, "ODD", level)

@@ -368,12 +368,12 @@ def test_what_is_specified_is_known_and_not_likely():
     spin = scenarios.load_scenario("spin")
     spin = replace(spin, gyro=replace(spin.gyro, scale_factor=np.full(3, 3e-3)), gyro_preset="")
     record = sd.simulate(spin, seed=3)
-    found, _ = sd.diagnose(sd.estimate(record, states=False), record)
-    assert found.cause_words.startswith("Known, as specified: the gyro's scale factor is in error by [")
-    marks = {(row[0], row[1]): row[-1] for row in found.listing().rows}
+    causes, _ = sd.diagnose(sd.estimate(record, states=False), record)
+    assert causes.cause_words.startswith("Known, as specified: the gyro's scale factor is in error by [")
+    marks = {(row[0], row[1]): row[-1] for row in causes.listing().rows}
     assert marks["scale factor", "gyro"] == "known"
     assert marks["initial bias", "start"] == "likely"
-    assert [cause.name for cause in found.causes if cause.known] == ["scale factor"]
+    assert [cause.name for cause in causes.causes if cause.known] == ["scale factor"]
     silent = replace(record, origin=None)
     unknown, _ = sd.diagnose(replace(sd.estimate(record, states=False), origin=None), silent)
     assert not any(cause.known for cause in unknown.considered)
