@@ -29,12 +29,13 @@ from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.consistency import Judgement
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
-from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
+from strapdown.files import locked, reading, set_attributes
 from strapdown.montecarlo import verdicts
 from strapdown.montecarlo.engine import MACHINES, Identity, Work, Workers, choose, chunks_of, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import ARRAYS, Statistics, lengths_of, merge
-from strapdown.records import CONVENTIONS, put
+from strapdown.records import put
+from strapdown.records.result_files import result_file
 from strapdown.results import Listed, Table
 
 __all__ = ["Campaign", "read", "run"]
@@ -331,25 +332,22 @@ def _write(path: Path, campaign: Campaign) -> None:
 
     plan = campaign.plan
     packages = {module.__name__: module.__version__ for module in (np, numba, h5py)}
-    with atomic_write(path, durable=True) as temporary, whole_hdf5(temporary) as file:
-        attributes = {
-            "kind": KIND,
-            "format": FORMAT,
-            **campaign.identity._asdict(),
-            "versions": json.dumps({"python": platform.python_version(), **packages}),
-            "conventions": CONVENTIONS,
-            "scenario": scenarios.scenario_to_toml(plan.scenario),
-            "filter": setup.to_toml(plan.setup),
-            "plan": json.dumps(plan.to_table(), default=float),
-            "digest": plan.digest,
-            "seed": plan.seed,
-            "machine": campaign.machine,
-            "chunk": campaign.chunk,
-            "runs": campaign.runs,
-            "finished_runs": campaign.finished_runs,
-            "seconds": campaign.seconds,
-        }
-        set_attributes(file, attributes)
+    attributes = {
+        "format": FORMAT,
+        **campaign.identity._asdict(),
+        "versions": json.dumps({"python": platform.python_version(), **packages}),
+        "scenario": scenarios.scenario_to_toml(plan.scenario),
+        "filter": setup.to_toml(plan.setup),
+        "plan": json.dumps(plan.to_table(), default=float),
+        "digest": plan.digest,
+        "seed": plan.seed,
+        "machine": campaign.machine,
+        "chunk": campaign.chunk,
+        "runs": campaign.runs,
+        "finished_runs": campaign.finished_runs,
+        "seconds": campaign.seconds,
+    }
+    with result_file(path, "montecarlo", attributes, durable=True) as file:
         if campaign.statistics is not None:
             _put_statistics(file.create_group("statistics"), campaign.statistics)
         if campaign.whole is not None and campaign.whole.runs < campaign.finished_runs:

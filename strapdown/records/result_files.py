@@ -24,9 +24,11 @@ CHUNK_ROWS = 4096
 
 
 @contextlib.contextmanager
-def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
-    """Yield an HDF5 file with its kind, version and conventions as attributes; it is created only when complete."""
-    with atomic_write(path) as temporary, whole_hdf5(temporary) as file:
+def result_file(
+    path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None, *, durable: bool = False
+) -> Iterator[Any]:
+    """Yield an HDF5 file with its kind, version and conventions as attributes; written by :func:`strapdown.files.atomic_write`."""
+    with atomic_write(path, durable=durable) as temporary, whole_hdf5(temporary) as file:
         own = {"kind": f"strapdown {kind}", "version": strapdown.__version__, "conventions": CONVENTIONS}
         set_attributes(file, {**own, **(attributes or {})})
         yield file
