@@ -501,7 +501,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
         bottom.set(yscale=scale, xlabel="time, s")
         bottom.set_title(f"{scale} scale", loc="right", fontsize="small")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
-    grid[1, 0].set_ylabel("ANEES / 6")
+    grid[1, 0].set_ylabel("ANEES")
     style.legend_below(figure, [grid[1, 0]], ncols=5)
     return plots.save(figure, path)
 

@@ -108,8 +108,8 @@ def axes_of(show: bool) -> Any:
 def draw(axes: Any, rows: Array) -> None:
     """Draw rows of time, error and σ."""
     axes.clear()
-    axes.plot(rows[:, 0], rows[:, 1] / DEGREE, color=style.VERMILION, label="error")
-    axes.plot(rows[:, 0], rows[:, 2] / DEGREE, color=style.BLUE, label="σ, all axes")
+    axes.plot(rows[:, 0], rows[:, 1] / DEGREE, color=style.VERMILION, label="error, total angle")
+    axes.plot(rows[:, 0], rows[:, 2] / DEGREE, color=style.BLUE, label="σ, root sum square of the three axes")
     axes.set(xlabel="time, s", ylabel="attitude, °", yscale="log")
     axes.grid(visible=True, alpha=0.25)
     axes.legend()

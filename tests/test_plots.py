@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from strapdown import allan, consistency, covariance, montecarlo, plots, quaternion, units
+from strapdown import allan, consistency, covariance, gyro, montecarlo, plots, quaternion, units
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
@@ -314,11 +314,15 @@ def figures(run, statistics, outcomes):
         variance=np.ones((len(estimate.time), 9)),
     )
     with_states = dataclasses.replace(estimate, error_states={"gyro scale": block})
+    spec = gyro.GyroSpec(quantization=1.5e-6, angle_random_walk=3e-5, bias_instability=1e-4, rate_random_walk=5e-5)
+    increments = gyro.simulate(spec, np.zeros((50000, 3)), 0.01 * np.arange(50001), np.random.default_rng(1)).increments
+    all_terms = (f(increments, 0.01, kind="increments") for f in (allan.allan_deviation, allan.fit_noise))
     return {
         "estimate": plots.estimate_overview(estimate, title="record.h5"),
         "states": plots.states_over_time(with_states, title="record.h5"),
         "coning consistency": plots.coning_consistency(outcomes),
         "runs": plots.runs_overview(statistics),
+        "Allan": plots.allan_overview(*all_terms),
     }
 
 

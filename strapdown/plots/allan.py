@@ -39,7 +39,7 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
     axes[0, 0].set_ylabel(f"Allan deviation, {unit}")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale
     axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())
-    style.legend_below(figure, list(axes[0]), ncols=8)
+    style.legend_below(figure, list(axes[0]), ncols=min(4, 2 * number))
     return figure
 
 
