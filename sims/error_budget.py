@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -85,6 +87,7 @@ def main(
     epochs: int = 100,
     seed: int = 1,
     out: str | os.PathLike[str] | None = None,
+    progress: Callable[[str], None] = lambda line: None,
 ) -> Result:
     """Predict and run; ``duration`` in s, that of the scenario if not given. Figures and table are written to ``out`` if it is given."""
     base = scenarios.load_scenario(scenario)
@@ -94,11 +97,14 @@ def main(
     noise = matched.process_noise
     half = ProcessNoise(angle_random_walk=0.5 * noise.angle_random_walk, rate_random_walk=0.5 * noise.rate_random_walk)
     filters = {"matched": matched, "a quarter of Q": replace(matched, process_noise=half)}
-    plans = {name: montecarlo.Plan(scenario=base, setup=f, seed=seed, epochs=epochs) for name, f in filters.items()}
-    result = Result(
-        analyses={name: covariance.analyse(base, f, epochs=epochs) for name, f in filters.items()},
-        statistics={name: montecarlo.run_plan(plan, runs=runs) for name, plan in plans.items()},
-    )
+    analyses, statistics = {}, {}
+    for name, f in filters.items():
+        progress(f"{name}: covariance analysis")
+        analyses[name] = covariance.analyse(base, f, epochs=epochs)
+        progress(f"{name}: {runs} runs")
+        plan = montecarlo.Plan(scenario=base, setup=f, seed=seed, epochs=epochs)
+        statistics[name] = montecarlo.run_plan(plan, runs=runs)
+    result = Result(analyses=analyses, statistics=statistics)
     if out is not None:
         folder = Path(out)
         folder.mkdir(parents=True, exist_ok=True)
@@ -114,4 +120,4 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", default="tumbling-satellite", help="name of a built-in scenario, or a TOML file")
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    print(table(main(**vars(parser.parse_args()))))
+    print(table(main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))))

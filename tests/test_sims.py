@@ -17,7 +17,7 @@ import pytest
 
 from benchmarks import recordings as leaderboard
 from sims import coning_algorithms as sim
-from sims import hand_held
+from sims import error_budget, hand_held
 from strapdown import quaternion
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,6 +74,14 @@ def test_sim_runs_small(path, tmp_path):
         pytest.fail(f"sims/{path.name} took more than {SECONDS} s; define SMALL there, arguments that make main quick")
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Warning" not in done.stderr, done.stderr[-3000:]
+
+
+@pytest.mark.slow
+def test_the_error_budget_reports_what_it_computes_before_it_does():
+    lines = []
+    error_budget.main(**error_budget.SMALL, progress=lines.append)
+    assert lines[:2] == ["matched: covariance analysis", "matched: 4 runs"]
+    assert len(lines) == 4
 
 
 # The tests of the whole sim are slow: a step of .ci/run.
