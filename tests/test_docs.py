@@ -253,7 +253,7 @@ def write_walk(path):
 
 def test_the_tables_of_recordings_are_those_of_the_data_files():
     """As ``benchmarks/recordings.py`` and ``benchmarks/recording_parameters.py`` print them."""
-    page = (DOCS / "guide" / "recording.md").read_text(encoding="utf-8")
+    page = (DOCS / "comparison.md").read_text(encoding="utf-8")
     scores, parts = (
         json.loads((DOCS / "_data" / f"{name}.json").read_text()) for name in ("recordings", "recording_parts")
     )
