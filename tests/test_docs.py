@@ -3,11 +3,14 @@
 The pages' code is run by the build of the site (``docs/conf.py``), not here.
 """
 
+import builtins
 import importlib
 import json
 import pkgutil
 import re
 import shlex
+import symtable
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -249,6 +252,34 @@ def write_walk(path):
     )
     np.savetxt(path, rows, delimiter=",", header="time,gx,gy,gz,ax,ay,az", comments="")
     return angle
+
+
+def code_of(page: Path) -> Iterator[tuple[str, bool]]:
+    """Yield the Python of each cell that is executed, and whether a reader can copy it."""
+    for cell in re.findall(
+        r"^```\{code-cell\}[^\n]*\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        tags, code = re.match(r"(:tags:[^\n]*\n)?\n*(.*)", cell, re.DOTALL).groups()
+        if not code.startswith("%%"):
+            yield code, "remove-input" not in (tags or "")
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if any(code_of(page))], ids=lambda page: page.stem)
+def test_cells_that_can_be_copied_need_none_that_cannot(page):
+    known = set(dir(builtins))
+    for code, visible in code_of(page):
+        if visible:
+            table = symtable.symtable(code, page.stem, "exec")
+            known |= {
+                symbol.get_name() for symbol in table.get_symbols() if symbol.is_assigned() or symbol.is_imported()
+            }
+            assert names_from_elsewhere(table) <= known, code
+
+
+def names_from_elsewhere(table: symtable.SymbolTable) -> set[str]:
+    """Return the global names that code and its functions read."""
+    own = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_referenced() and symbol.is_global()}
+    return own.union(*map(names_from_elsewhere, table.get_children()))
 
 
 def test_the_tables_of_recordings_are_those_of_the_data_files():
