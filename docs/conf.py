@@ -128,7 +128,7 @@ numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
 html_theme = "furo"
-html_title = "strapdown"
+html_title = f"strapdown {version}"
 _scripts = tempfile.TemporaryDirectory()
 bundle.write(Path(_scripts.name))
 html_static_path = ["_static", _scripts.name]
