@@ -210,8 +210,8 @@ class Judgement(ByValue, Listed):
         )
         meaning = (
             f"Bounds, pass and FAIL are for all tests together: a consistent filter fails with at most "
-            f"{100.0 * (1.0 - self.confidence_level):.2g} %. Each p-value is for one statistic; NIS and NEES are per degree of freedom; of "
-            "correlated samples the effective number is given."
+            f"{100.0 * (1.0 - self.confidence_level):.2g} %. Each p-value is for one statistic; NIS and NEES are per degree of freedom; "
+            "the number of correlated samples is the effective one."
         )
         notes = [*([meaning] if rows else []), *(f"Note: {limit}." for limit in self.limits)]
         return Table(self.headline, columns, rows, notes, left=2, name="consistency")

@@ -37,7 +37,7 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
     light = {**dark, "alpha": 0.18}
     ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **dark)
     if (most > 1.02 * least).any():
-        ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **light)
+        ax.fill_between(edges, least, most, label="its increase between measurements", **light)
         ax.fill_between(edges, -most, -least, **light)
     ax.axhline(0.0, color=style.ink(), linewidth=0.6)
     words = f"error, {len(error)} runs" if len(error) > 1 else "error"
