@@ -220,6 +220,17 @@ def test_the_filter_file_is_described_with_its_own_keys():
         assert keys <= described_keys if name == "filter" else keys == described_keys  # integration has no default here
 
 
+def test_the_statistics_of_a_verdict_are_explained():
+    record = strapdown.simulate("two-stars")
+    judged = (
+        strapdown.check(strapdown.estimate(record), record),
+        strapdown.check(strapdown.monte_carlo("two-stars", runs=8)),
+    )
+    page = (DOCS / "guide/verdict.md").read_text(encoding="utf-8")
+    shown = {finding.name for judgement in judged for finding in judgement.findings}
+    assert shown <= set(re.findall(r"^\| ([\w -]+) \|", page, re.MULTILINE))
+
+
 def test_tests_that_pages_name_exist():
     """Each formula of the mathematics names the test that checks it."""
     named = {
