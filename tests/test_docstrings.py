@@ -82,7 +82,7 @@ class _Reference(Validator):  # type: ignore[misc]
     def is_function_or_method(self) -> bool:
         return inspect.isroutine(self.obj)  # class methods too
 
-    @property
+    @functools.cached_property
     def doc_all_parameters(self) -> Any:
         if getattr(self.obj, "_is_protocol", False):
             return {}
