@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     # Workers process file after file. Neighbouring files share kernels: in this order two workers seldom compile the same ones at once,
     # and the second finds them in the cache.
     files = list(dict.fromkeys(item.path for item in items))
-    place = {path: (k % 12, k) for k, path in enumerate(files)}
+    place = {path: (k % 10, k) for k, path in enumerate(files)}
     items.sort(key=lambda item: place[item.path])
     if not config.getoption("--slow"):
         # By the marker, because keywords include the names of folders.
