@@ -155,16 +155,17 @@ def time_of_other_threads():
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks)
 
 
-for call in (
+analyses = (
     lambda: allan.allan_deviation(values, 0.01),
     lambda: allan.allan_deviation(gappy, 0.01),
     lambda: allan.fit_noise(gappy, 0.01, terms=allan.TERMS[1:2]),
     lambda: allan.temperature.fit_temperature(values[:20_000], np.linspace(20.0, 30.0, 20_000), 0.01, order=2),
     lambda: effective_samples(np.resize(values, (10_000, 20))),
-    # By BLAS, whose threads go on for a while; often, because on a busy machine one may be over before they begin.
-    lambda: [np.linalg.qr(np.resize(values, (10_000, 20))) for _ in range(50)],
-):
+)
+for call in analyses:
     call()  # compiles and imports
+# By BLAS, whose threads go on for a while; often, because on a busy machine one may be over before they begin.
+for call in (*analyses, lambda: [np.linalg.qr(np.resize(values, (10_000, 20))) for _ in range(50)]):
     before = time_of_other_threads()
     call()
     print(time_of_other_threads() - before)
