@@ -74,7 +74,7 @@ def imported(tree: ast.AST) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"line {node.lineno}: import by the full name, not relatively"
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif not only_for_types(node):
+        elif isinstance(node, ast.stmt | ast.ExceptHandler | ast.match_case) and not only_for_types(node):
             yield from imported(node)
 
 
@@ -135,14 +135,16 @@ NOT_OF_THE_USER = ("kernels.machine", "kernels.cache", "montecarlo.engine", "rep
 
 
 @cache
+def nodes() -> list[tuple[str, ast.Call | ast.Attribute]]:
+    """Every call and attribute of the package, with its module."""
+    every = ((module, node) for module, tree in sources().items() for node in ast.walk(tree))
+    return [(module, node) for module, node in every if isinstance(node, ast.Call | ast.Attribute)]
+
+
+@cache
 def calls() -> list[tuple[str, ast.Call, str]]:
     """Every call of the package: its module, itself and the words of what is called."""
-    return [
-        (module, node, ast.unparse(node.func))
-        for module, tree in sources().items()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-    ]
+    return [(module, node, ast.unparse(node.func)) for module, node in nodes() if isinstance(node, ast.Call)]
 
 
 def test_every_file_passes_the_reading_layer():
@@ -202,11 +204,11 @@ def test_global_random_numbers_are_not_used():
     """Randomness is an argument."""
     for module, tree in sources().items():
         assert "random" not in top_names(tree), module
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Attribute) and getattr(node.value, "attr", "") == "random":
-                assert ast.unparse(node.value) not in ("np.random", "numpy.random") or node.attr in RANDOM, (
-                    f"{module} line {node.lineno}: {ast.unparse(node)}"
-                )
+    for module, node in nodes():
+        if isinstance(node, ast.Attribute) and getattr(node.value, "attr", "") == "random":
+            assert ast.unparse(node.value) not in ("np.random", "numpy.random") or node.attr in RANDOM, (
+                f"{module} line {node.lineno}: {ast.unparse(node)}"
+            )
     for module, node, call in calls():
         if call.endswith(("default_rng", "SeedSequence")):
             assert node.args or node.keywords, f"{module} line {node.lineno}: {ast.unparse(node)} without a seed"
