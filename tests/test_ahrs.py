@@ -289,16 +289,17 @@ def test_sigma_of_the_heading_includes_iron_that_small_slow_turns_hardly_show(sm
     attitude, random = slow(time), np.random.default_rng(6)
     noise = random.standard_normal((3, len(time), 3))
     field = np.array([0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)])
+    swung = dataclasses.replace(
+        plain,
+        rate=rates(time, slow) + 3e-3 * noise[0],
+        specific_force=attitude.inv().apply([0.0, 0.0, 9.81]) + 0.03 * noise[1],
+        magnetic_field=attitude.inv().apply(field) + 0.3 * noise[2],
+        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
+    )
     squares = []
     for iron in random.normal(0.0, 0.04 * 50.0, (12, 3)):
-        swung = dataclasses.replace(
-            plain,
-            rate=rates(time, slow) + 3e-3 * noise[0],
-            specific_force=attitude.inv().apply([0.0, 0.0, 9.81]) + 0.03 * noise[1],
-            magnetic_field=attitude.inv().apply(field) + iron + 0.3 * noise[2],
-            true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
-        )
-        result = ahrs.estimate(swung, latency=0.0, smooth=smooth, full_covariance=True)
+        shifted = dataclasses.replace(swung, magnetic_field=swung.magnetic_field + iron)
+        result = ahrs.estimate(shifted, latency=0.0, smooth=smooth, full_covariance=True)
         R = quaternion.to_matrix(result.estimate.attitude[-1])
         squares.append(
             (worst(result, 59.9)["heading"] * DEGREE) ** 2 / (R @ result.estimate.covariance[-1, :3, :3] @ R.T)[2, 2]
