@@ -18,6 +18,7 @@ from strapdown.ahrs import AhrsParameters, estimating, regions, remarks, startin
 from strapdown.calibration import SensorErrors, UnitCalibration
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
+from strapdown.consistency.accuracy import accuracy
 from strapdown.estimation import setup
 from strapdown.estimation.states import changed
 from strapdown.kernels import headings as kernels
@@ -1043,9 +1044,7 @@ def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
     moving = hand_held.modified(whole)["no rest"]
     result = ahrs.estimate(moving, latency=0.0, full_covariance=True)
     assert np.sqrt(result.initial.covariance[0, 0]) > 6.0 * DEGREE
-    total = consistency.accuracy.accuracy(result.estimate, Truth(attitude=moving.true_attitude)).given["all samples"][
-        "total"
-    ]
+    total = accuracy(result.estimate, Truth(attitude=moving.true_attitude)).given["all samples"]["total"]
     assert total.coverage > 0.9
     assert total.rms < 15.0 * DEGREE
 
@@ -1102,7 +1101,7 @@ def test_sigma_holds_on_broad_trials(broad):
     for number in ("07", "21"):
         for smooth in (False, True):
             estimate = estimated(next(broad.glob(f"{number}_*.hdf5")), smooth)
-            total = sd.accuracy(estimate).given["movement"]["total"]
+            total = accuracy(estimate).given["movement"]["total"]
             assert total.coverage > 0.9, (number, smooth, total)
             # Of a σ that is right, the errors, that of the heading of the whole recording included, are as large as it.
             variance = estimate.variance[estimate.truth.movement, :3].sum(axis=1).mean()
@@ -1113,7 +1112,7 @@ def test_sigma_holds_on_broad_trials(broad):
 def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
     """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
     files = sorted(broad.glob("*.hdf5"))
-    held = [sd.accuracy(estimated(file, smooth)).given["movement"]["inclination"].coverage for file in files]
+    held = [accuracy(estimated(file, smooth)).given["movement"]["inclination"].coverage for file in files]
     assert 0.92 < np.mean(held) < 0.995, held
     assert min(held) > 0.8, held
 
