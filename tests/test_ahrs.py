@@ -192,6 +192,7 @@ def test_a_heading_stands_at_the_end_of_its_interval():
     np.testing.assert_allclose(np.diff(since)[:-1], 0.15, atol=1e-9)
 
 
+@functools.cache
 def disturbed(length: float, turn: float = 40.0) -> Recording:
     """A minute in which something magnetic turns the field by 40° and makes it stronger from 20 s on."""
     plain = recording(60.0, bias=(0.002, -0.001, 0.001), noise=0.3)
@@ -219,6 +220,7 @@ IRON = np.array([1.5, -1.0, 1.8])
 """5 % of the field, more than the stationary σ of 4 %."""
 
 
+@functools.cache
 def with_iron() -> Recording:
     plain = recording(75.0, noise=0.3)
     return dataclasses.replace(plain, magnetic_field=plain.magnetic_field + IRON)
@@ -251,6 +253,7 @@ def test_running_medians_are_those_of_numpy(capacity, tolerance):
         np.testing.assert_allclose(memory.median[2], np.median(values[: k + 1]), atol=tolerance)
 
 
+@functools.cache
 def on_a_table(iron: tuple[float, ...] = (0.0, 0.0, 0.0), duration: float = 120.0) -> Recording:
     """A unit at rest whose gyro has a bias of 1.7 °/s."""
     time = np.arange(round(duration * 50.0)) / 50.0
@@ -308,6 +311,7 @@ def test_sigma_of_the_heading_includes_iron_that_small_slow_turns_hardly_show(sm
     assert 0.2 < np.mean(squares) < 2.0
 
 
+@functools.cache
 def in_a_hurry(duration, lever_arm=0.0, seed=3):
     """A recording of :func:`brisk`, its sensors ``lever_arm`` m along x from the point about which the unit turns."""
     time = np.arange(round(duration * RATE)) / RATE
@@ -318,6 +322,7 @@ def in_a_hurry(duration, lever_arm=0.0, seed=3):
     return measured("a hurry", 100.0 + time, attitude, rate + bias, **options)
 
 
+@functools.cache
 def with_dropout() -> Recording:
     whole = in_a_hurry(30.0)
     return whole.taken((whole.time < 120.0) | (whole.time > 120.5))
@@ -689,6 +694,7 @@ def test_the_smoothers_acceleration_follows_that_of_the_recording(variation, fac
     assert dataclasses.replace(parameters, velocity_sigma=smoothed.velocity_sigma) == smoothed
 
 
+@functools.cache
 def driven(duration: float = 60.0) -> Recording:
     """A car that sets off after two seconds and turns left and right at 8 m/s, on a road that shakes it."""
     time = np.arange(round(duration * RATE)) / RATE
@@ -759,6 +765,7 @@ def test_the_acceleration_of_a_vessel_on_waves_does_not_pass_for_tilt():
     assert own < 0.75 * hand
 
 
+@functools.cache
 def late(gyro: float = 0.0, field: float = 0.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Recording:
     """Half a minute of brisk motion; gyro and accelerometer show what was ``gyro`` s ago, the magnetometer ``field`` s more."""
     time = np.arange(round(30.0 * RATE)) / RATE
