@@ -750,6 +750,20 @@ def test_after_a_slew_about_one_axis_no_rotation_is_invented():
     np.testing.assert_allclose([a.fixed, a.body], [[0.0, 0.0, -0.2], np.zeros(3)], atol=1e-4)
 
 
+def test_at_a_constant_rate_a_far_frame_is_no_offset_of_the_clock():
+    """A shift in time is then a rotation. An attitude relative to North-East-Down had its clock moved by the 30 s of the search."""
+    time = np.arange(0.0, 300.0, 0.5)
+    exact = quaternion.exp(np.outer(time, np.array([0.1, -0.2, 0.5]) * DEGREE))
+    size = np.where(time < 2.0, 1e-2, 1e-4)[:, None]  # without the first samples the residual is smaller
+    noise = quaternion.exp(size * np.random.default_rng(0).standard_normal((len(time), 3)))
+    own = alignment.Series(time, to_ned(quaternion.multiply(exact, noise)))
+    _, a = alignment.align_series(own, alignment.Series(time, exact), None, [])
+    assert a.estimated == ("fixed",)
+    np.testing.assert_allclose(
+        quaternion.to_matrix(quaternion.exp(a.fixed)), quaternion.to_matrix(to_ned([1.0, 0, 0, 0])).T, atol=1e-4
+    )
+
+
 def test_an_alignment_is_described_with_its_sigma():
     sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
     fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE

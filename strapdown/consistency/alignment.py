@@ -204,7 +204,7 @@ def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_spee
     return float(base + lags[best] * step) if share > 0.5 else float(base)
 
 
-def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple[Array, Array]]:
+def _initial_rotations(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> list[tuple[Array, Array]]:
     """Return (fixed, body) quaternions to start from: identity, the fixed frame's, and with the body frame's from the rates."""
     matched, truth = at_common_times(own, theirs, offset)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
@@ -213,7 +213,13 @@ def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
         return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
 
-    pairs = [(identity, identity), (fixed_of(identity), identity)]
+    pairs = [(identity, identity)]
+    if "fixed" in names:
+        turn = fixed_of(identity)
+        # From afar the first step would move the clock: at a constant rate it is a rotation too.
+        pairs = [(turn, identity)] if abs(turn[0]) < 0.9 else [*pairs, (turn, identity)]
+    if not {"fixed", "body"} <= set(names):
+        return pairs
     _, w_own = rates(matched)
     _, w_true = rates(Series(matched.time, truth.attitude))
     # Wahba's problem: w_true = Bᵀ w_own.
@@ -228,10 +234,9 @@ def _initial_rotations(own: Series, theirs: Series, offset: float) -> list[tuple
 def fit(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> Alignment:
     """Return offset and rotations by least squares of the remaining angle; σ from the effective number of residuals."""
     best: Alignment | None = None
-    for fixed, body in _initial_rotations(own, theirs, offset):
-        if ("fixed" in names or fixed[0] == 1.0) and ("body" in names or body[0] == 1.0):
-            fitted = _descended(own, theirs, names, fixed, body, offset)
-            best = fitted if best is None or fitted.residual < 0.999 * best.residual else best
+    for fixed, body in _initial_rotations(own, theirs, names, offset):
+        fitted = _descended(own, theirs, names, fixed, body, offset)
+        best = fitted if best is None or fitted.residual < 0.999 * best.residual else best
     assert best is not None
     return best
 
