@@ -764,6 +764,22 @@ def test_at_a_constant_rate_a_far_frame_is_no_offset_of_the_clock():
     )
 
 
+def test_the_first_errors_of_a_filter_do_not_decide_its_alignment():
+    """σ of 6° for two seconds and 0.006° for five minutes: unweighted, σ of the frame would be 57 times as large."""
+    time = np.arange(0.0, 300.0, 0.5)
+    exact = FLIGHT.motion.attitude(time)
+    sigma = np.where(time < 2.0, 0.1, 1e-4)
+    noise = quaternion.exp(sigma[:, None] * np.random.default_rng(0).standard_normal((len(time), 3)))
+    own = quaternion.multiply(F, quaternion.multiply(exact, noise))
+    P = sigma[:, None, None] ** 2 * np.eye(3)
+    outcome = check_arrays(time, own, P, time, exact)
+    a = outcome.alignment
+    assert a.estimated == ("fixed",)
+    np.testing.assert_allclose(a.sigma[:3], 1e-4 / np.sqrt(len(time) - 4), rtol=0.15)
+    assert np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.exp(a.fixed), F))) < 4.0 * a.sigma[0]
+    assert outcome.judgement.verdict == "consistent"
+
+
 def test_an_alignment_is_described_with_its_sigma():
     sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
     fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE

@@ -211,7 +211,7 @@ def _initial_rotations(own: Series, theirs: Series, names: tuple[str, ...], offs
 
     def fixed_of(body: Array) -> Array:
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
-        return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
+        return quaternion.from_rotation(quaternion.to_rotation(turns).mean(_weights(matched)[:, 0] ** 2))
 
     pairs = [(identity, identity)]
     if "fixed" in names:
@@ -232,7 +232,7 @@ def _initial_rotations(own: Series, theirs: Series, names: tuple[str, ...], offs
 
 
 def fit(own: Series, theirs: Series, names: tuple[str, ...], offset: float) -> Alignment:
-    """Return offset and rotations by least squares of the remaining angle; σ from the effective number of residuals."""
+    """Return offset and rotations by weighted least squares of the remaining angle; σ from the effective number of residuals."""
     best: Alignment | None = None
     for fixed, body in _initial_rotations(own, theirs, names, offset):
         fitted = _descended(own, theirs, names, fixed, body, offset)
@@ -251,10 +251,11 @@ def _descended(
     for _ in range(20):
         matched, truth = at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
-        left = r = turns(aligned, truth.attitude)
+        weight = _weights(matched)
+        left = r = weight * turns(aligned, truth.attitude)
         if not free.any():
             break
-        J = jacobian(matched.time, aligned, truth)[:, :, free]
+        J = weight[:, :, None] * jacobian(matched.time, aligned, truth)[:, :, free]
         information = np.einsum("mij,mik->jk", J, J)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         value, vector = np.linalg.eigh(information * np.outer(scale, scale))
@@ -281,8 +282,19 @@ def _descended(
         body=quaternion.log(body),
         covariance=covariance,
         estimated=tuple(name for name in ALIGNED if name in names),
-        residual=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+        residual=float(np.sqrt(np.mean(np.sum((left / weight) ** 2, axis=1)))),
     )
+
+
+def _weights(own: Series) -> Array:
+    """Return the weight (m, 1) of each error: where a filter's σ is larger than its median, as before it converges, the ratio of both."""
+    weight = np.ones((len(own.time), 1))
+    if own.covariance is not None:
+        size = np.trace(own.covariance[:, :3, :3], axis1=1, axis2=2)
+        rows = size > 0.0  # others are refused later
+        if rows.any():
+            weight[rows, 0] = np.sqrt(np.minimum(1.0, np.median(size[rows]) / size[rows]))
+    return weight
 
 
 def jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
