@@ -125,9 +125,13 @@ def test_a_filter_that_fails_in_a_run_is_counted(own):
         late = estimate.time > 10.0
         return replace(estimate, attitude=np.where(late[:, None], np.nan, estimate.attitude))
 
-    statistics = montecarlo.run_plan(with_filter(failing), runs=3)
+    plan = with_filter(failing)
+    statistics = montecarlo.run_plan(plan, runs=3)
     assert statistics.failed == 3
     assert statistics.judge().verdict == "not consistent"
+    errors, coverage = verdicts.tables(verdicts.summary(statistics, bound=verdicts.bound_of(plan)))
+    assert not errors.notes
+    assert "In 3 runs the filter failed: no finite error or covariance." in coverage.notes
 
 
 def test_a_too_modest_filter_is_found_out():

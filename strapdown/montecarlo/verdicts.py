@@ -110,7 +110,7 @@ def _errors(summary: Mapping[str, Any]) -> Table:
         for k, axis in enumerate("xyz")
     ]
     notes = []
-    if ratios := dict(summary.get("rms_over_root_cramer_rao_bound", {})):
+    if (ratios := dict(summary.get("rms_over_root_cramer_rao_bound", {}))) and not summary["failed_runs"]:
         low, high = ratios.pop("bounds_of_an_efficient_filter")
         axes = "; ".join(f"{name} {', '.join(f'{x:.3f}' for x in values)}" for name, values in ratios.items())
         notes.append(
