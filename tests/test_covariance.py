@@ -716,6 +716,15 @@ def test_the_initial_bias_contains_the_part_too_fast_for_a_state():
     np.testing.assert_allclose(analysis.filter_sigma[0, 3:], belief.bias_sigma, rtol=1e-9)
 
 
+def test_innovations_that_will_contradict_the_filter_are_named():
+    """From an initial error of five times its σ the filter recovers, and a Monte Carlo rejects its innovations (NIS 2.27)."""
+    analysis = covariance.analyse("cubesat", initial_attitude_sigma=5.0 * DEGREE, epochs=5)
+    np.testing.assert_allclose(analysis.expected_nees[-1], 1.0, atol=0.01)
+    assert (
+        analysis.words == "The errors at the end will agree with σ, but not the innovations: NIS of star tracker 2.31."
+    )
+
+
 def test_only_an_error_that_is_drawn_in_every_run_is_said_to_average_out():
     scenario, belief = with_states()
     analysis = covariance.analyse(scenario, belief, epochs=2)

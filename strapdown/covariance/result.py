@@ -16,7 +16,7 @@ from strapdown.units import DEGREE
 LARGEST_LINEAR = 0.15
 """Errors of attitude or direction above this are reported as beyond linear, rad; their squares are above a tenth of them."""
 MIN_NEES, MAX_NEES = 0.9, 1.1
-"""Limits of the expected NEES per state of a consistent filter."""
+"""Limits of the expected NEES per state, and of the NIS, of a consistent filter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +106,7 @@ class Analysis(Listed):
 
     @property
     def words(self) -> str:
-        """Whether the filter will be consistent at the last epoch."""
+        """Whether the errors at the last epoch and all innovations will be consistent with the filter."""
         _, attitude, bias = self.expected_nees[-1]
         largest = float(max(*self.rms[-1, :3], *self.filter_sigma[-1, :3]))
         if largest > LARGEST_LINEAR:
@@ -125,6 +125,9 @@ class Analysis(Listed):
             )
         if min(attitude, bias) < MIN_NEES:
             return "The filter will be pessimistic: its σ will be larger than its errors."
+        odd = [f"{name} {nis:.3g}" for name, nis in self.expected_nis.items() if not MIN_NEES <= nis <= MAX_NEES]
+        if odd:
+            return f"The errors at the end will agree with σ, but not the innovations: NIS of {', '.join(odd)}."
         return "The filter will be consistent."
 
     @property
