@@ -417,6 +417,8 @@ def test_tables_are_readable():
         ("arw", "°/s/√Hz", math.pi / 180.0),
         ("arw", "deg/h/sqrt(Hz)", math.pi / 648000.0),
         ("arw", "mdeg/s/√Hz", math.pi / 180000.0),
+        ("arw", "dps/√Hz", math.pi / 180.0),
+        ("arw", "mdps/sqrt(Hz)", math.pi / 180000.0),
         ("bias_instability", "°/h", math.pi / 648000.0),
         ("bias_instability", "deg/hr", math.pi / 648000.0),
         ("rrw", "deg/h/sqrt(h)", math.pi / 648000.0 / 60.0),

@@ -55,7 +55,13 @@ def parse(name: str, text: str, wanted: str, example: str) -> float:
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example}")
     plain = re.sub(r"√(\w+)", r"sqrt(\1)", text.replace("°", " deg").replace("″", " arcsec"))
-    for symbol, unit in ((r"\bg\b", "standard_gravity"), (r"\bhr?\b", "hour"), (r"\bHz\b", "(1/second)")):
+    symbols = {
+        r"\bg\b": "standard_gravity",
+        r"\bhr?\b": "hour",
+        r"\bHz\b": "(1/second)",
+        r"\b(m?)dps\b": r"\1deg/second",
+    }
+    for symbol, unit in symbols.items():
         plain = re.sub(symbol, unit, plain)
     plain = re.sub(r"sqrt\(((?:[^()]|\([^()]*\))*)\)", r"((\1) ** 0.5)", plain)
     try:
