@@ -28,6 +28,11 @@ def test_the_built_in_ones_are_those_asked_for():
     assert all(note.partition(": ")[2] for note in table.notes)
 
 
+@pytest.mark.parametrize("name", ["cubesat", "earth-observer", "low-orbit", "magnetometer-only", "tumbling-satellite"])
+def test_satellites_are_in_free_fall(name):
+    assert load_scenario(name).gravity_f == (0.0, 0.0, 0.0)
+
+
 @pytest.mark.parametrize("name", scenarios.SCENARIOS)
 def test_built_in_scenarios_simulate_and_survive_a_file(name, tmp_path):
     short = dataclasses.replace(load_scenario(name), duration=4.0)
