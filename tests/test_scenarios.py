@@ -33,6 +33,12 @@ def test_satellites_are_in_free_fall(name):
     assert load_scenario(name).gravity_f == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("value", ["slew", motion.Coning])
+def test_what_is_no_motion_is_refused(value):
+    with pytest.raises(InputError, match=r"^motion is .*(slew|Coning).*; give a motion, such as motion\.rest"):
+        dataclasses.replace(load_scenario("two-stars"), motion=value)
+
+
 @pytest.mark.parametrize("name", scenarios.SCENARIOS)
 def test_built_in_scenarios_simulate_and_survive_a_file(name, tmp_path):
     short = dataclasses.replace(load_scenario(name), duration=4.0)

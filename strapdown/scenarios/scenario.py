@@ -107,7 +107,7 @@ class Scenario(ByValue):
     temperature: Temperature | None = None
 
     def __post_init__(self) -> None:
-        """Check rate, duration, and the names of the sensors."""
+        """Check rate, duration, motion, gyro, and the names of the sensors."""
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
         if self.duration * self.rate > MAX_SAMPLES:
@@ -121,6 +121,8 @@ class Scenario(ByValue):
                 f"name is {self.name!r}, which is used in file names: leave out slashes, line breaks and leading dots"
             )
         instance("gyro", self.gyro, GyroSpec, "give the specification of a gyro")
+        if isinstance(self.motion, type) or not hasattr(self.motion, "increments"):
+            raise InputError(f"motion is {self.motion!r}; give a motion, such as motion.rest() or motion.Coning(…)")
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         names = [sensor.name for sensor in self.sensors]
