@@ -22,7 +22,8 @@ class Magnetometer(Sampled):
     name, rate, phase, faults : str, float, float, Faults
         As for :class:`VectorSensor`.
     field_f : ndarray (3,) or callable
-        Magnetic field, T, fixed frame; or a function of time (m,), s, that returns it (m, 3).
+        Magnetic field, T, fixed frame; in Python also a function of time (m,), s, that returns it (m, 3), in a file instead a table
+        ``orbit``.
     sigma : float
         Noise of each component, T.
     hard_iron : ndarray (3,), default zeros

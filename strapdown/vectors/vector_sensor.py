@@ -38,7 +38,8 @@ class VectorSensor(Sampled):
     reference_f : ndarray (3,)
         Direction measured, fixed frame; it is normalised.
     sigma : float
-        Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes.
+        Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad the NIS of a correct filter is too small,
+        by a fraction of about σ².
     kind : {"direction", "heading"}, default "direction"
         ``"direction"``, or ``"heading"`` (only the rotation about the fixed z axis).
 
