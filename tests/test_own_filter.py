@@ -119,19 +119,21 @@ def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
     assert "bias" not in judgement.words
 
 
-def test_a_filter_that_fails_in_a_run_is_counted(own):
+def test_a_filter_that_fails_in_a_run_is_counted(tmp_path):
     def failing(record, initial):
         estimate = wrapped(record, initial)
         late = estimate.time > 10.0
         return replace(estimate, attitude=np.where(late[:, None], np.nan, estimate.attitude))
 
     plan = with_filter(failing)
-    statistics = montecarlo.run_plan(plan, runs=3)
+    statistics = campaign.run(plan, tmp_path / "failing.h5", runs=3).statistics
     assert statistics.failed == 3
     assert statistics.judge().verdict == "not consistent"
     errors, coverage = verdicts.tables(verdicts.summary(statistics, bound=verdicts.bound_of(plan)))
     assert not errors.notes
     assert "In 3 runs the filter failed: no finite error or covariance." in coverage.notes
+    page, _ = campaigns.report(tmp_path / "failing.h5")
+    assert "At the end" not in page
 
 
 def test_a_too_modest_filter_is_found_out():

@@ -42,7 +42,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.section("Evidence", page.table(judgement.listing())),
         page.section("Key numbers", *parts),
         page.section("Over time", *_over_time(statistics, judgement)),
-        page.section("At the end", *_end(statistics)),
+        *([page.section("At the end", *_end(statistics))] if statistics.finite[-1] else []),
         _worst(statistics, path),
         page.section("Provenance", page.provenance(shown)),
     )
