@@ -134,6 +134,10 @@ def test_a_filter_that_fails_in_a_run_is_counted(tmp_path):
     assert "In 3 runs the filter failed: no finite error or covariance." in coverage.notes
     page, _ = campaigns.report(tmp_path / "failing.h5")
     assert "At the end" not in page
+    again = montecarlo.replay(plan, 0)
+    assert again.largest_nees(plan.time) == (np.inf, plan.time[plan.time > 10.0][0])
+    negative = replace(again, estimate=replace(again.estimate, covariance=-again.estimate.covariance))
+    assert negative.largest_nees(plan.time) == (np.inf, plan.time[0])
 
 
 def test_a_too_modest_filter_is_found_out():

@@ -80,15 +80,23 @@ class Replay:
     """Estimate at every filter step, with full covariances."""
 
     def largest_nees(self, epochs: ArrayLike) -> tuple[float, float]:
-        """Return the largest NEES of the states at these epochs (:attr:`Plan.time`), as in the list of worst runs, and its time, s."""
+        """Return the largest NEES of the states at these epochs (:attr:`Plan.time`), as in the list of worst runs, and its time, s.
+
+        It is infinite at the first epoch at which the filter has failed.
+        """
         estimate, truth, size = self.estimate, self.estimate.truth, 6 if self.estimate.has_bias else 3
         assert estimate.covariance is not None
         assert truth is not None
-        error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)
-        nees = consistency.nees(error[:, :size], estimate.covariance[:, :size, :size])
         rows = np.searchsorted(estimate.time, np.asarray(epochs) + 1e-9, side="right") - 1
-        worst = int(rows[np.argmax(nees[rows])])
-        return float(nees[worst]), float(estimate.time[worst])
+        q, P = estimate.attitude[rows], estimate.covariance[rows, :size, :size]
+        good = np.isfinite(np.c_[q, P.reshape(len(q), -1)]).all(axis=1)
+        good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
+        nees, kept = np.full(len(rows), np.inf), rows[good]
+        bias = np.nan_to_num(estimate.bias[kept])
+        error = consistency.errors(q[good], bias, truth.attitude[kept], truth.bias[kept])
+        nees[good] = consistency.nees(error[:, :size], P[good])
+        worst = int(np.argmax(nees))
+        return float(nees[worst]), float(estimate.time[rows[worst]])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
