@@ -613,6 +613,10 @@ def test_what_is_left_out_or_beyond_linear_is_reported():
     early = covariance.analyse(early, setup.FilterSetup.for_scenario(early, states=False), epochs=2)
     assert early.left_out == ("the gyro's quantisation", words := "the gyro's time stamps, late by -0.01 s")
     assert words in early.unmodelled
+    steady = white("two-stars", 4.0)
+    lossy = dataclasses.replace(steady, gyro=dataclasses.replace(steady.gyro, drop_probability=0.05))
+    for scene, words in ((steady, "The"), (lossy, "But for what is left out, the")):
+        assert covariance.analyse(scene, epochs=2).words == f"{words} filter will be consistent."
     assert any("accelerometer" in text for text in analysis.beyond_linear)
     wide = covariance.analyse(
         white("spin", 10.0),

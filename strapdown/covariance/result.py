@@ -128,7 +128,7 @@ class Analysis(Listed):
         odd = [f"{name} {nis:.3g}" for name, nis in self.expected_nis.items() if not MIN_NEES <= nis <= MAX_NEES]
         if odd:
             return f"The errors at the end will agree with σ, but not the innovations: NIS of {', '.join(odd)}."
-        return "The filter will be consistent."
+        return f"{'But for what is left out, the' if self.left_out else 'The'} filter will be consistent."
 
     @property
     def covariance(self) -> Array:
