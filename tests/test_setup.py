@@ -187,6 +187,8 @@ def test_what_the_filter_does_not_model_is_reported_in_words():
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
     assert "flicker" not in words
+    lossy = dataclasses.replace(clean, gyro=dataclasses.replace(clean.gyro, drop_probability=0.05), gyro_preset="")
+    assert unmodelled(lossy) == ("the gyro's lost samples, 5 % of all",)
 
 
 def test_a_gyro_with_unequal_axes_makes_its_filter_pessimistic_and_that_is_said():

@@ -111,6 +111,7 @@ def _of_gyro(spec: GyroSpec, gravity_f: Sequence[float]) -> list[tuple[Any, Spec
         (np.max(spec.quantization) + np.max(spec.rate_resolution), "quantisation", "", False),
         (ramp, f"rate ramp of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²", "", True),
         (spec.timestamp_error + spec.sampling_jitter, "irregular sampling or time stamps", "", False),
+        (spec.drop_probability, f"lost samples, {100.0 * spec.drop_probability:.3g} % of all", "", False),
     ]
     lag = SpecifiedError(f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz")
     return [
