@@ -100,7 +100,7 @@ def spinning(files):
 
 def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds, refusal, record, tmp_path):
     said = succeeds("estimate", record, "--out", tmp_path / "out", "--figures")
-    assert "Started from the first measurements" in said
+    assert "Started from the first measurements with 10 times their σ, since the filter uses them again: σ " in said
     assert "Gyro bias: RMS error" in said
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "estimate.h5",

@@ -10,7 +10,7 @@ from strapdown import estimation
 from strapdown.checks import Hint, InputError
 from strapdown.estimation import multiple_model, setup
 from strapdown.estimation.setup import FilterSetup
-from strapdown.estimation.states import State
+from strapdown.estimation.states import PRIOR_INFLATION, State
 from strapdown.records import ImuRecord, Origin
 from strapdown.units import DEGREE
 from strapdown.vectors.wahba import InconsistentError
@@ -52,7 +52,8 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
         return _by_multiple_models(
             record, filter_setup, _without_remedy(error), "One direction at a time does not determine the attitude"
         )
-    return Start(state, f"Started from the first measurements, σ {_sigma_words(state)}.")
+    again = f"with {PRIOR_INFLATION:g} times their σ, since the filter uses them again"
+    return Start(state, f"Started from the first measurements {again}: σ {_sigma_words(state)}.")
 
 
 def _without_remedy(error: InputError) -> str:
