@@ -215,8 +215,6 @@ def _measurements(events: Schedule) -> Measurements:
 def _left_out(origin: Origin, setup: FilterSetup) -> tuple[str, ...]:
     """Return the errors of a scenario, and the parts of a filter, that the analysis does not include."""
     terms = [error.words for error in specified_errors(origin) if not error.analysed]
-    if origin.scenario.gyro.drop_probability > 0.0:
-        terms.append("the gyro's lost samples")
     if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):
         terms.append("states for the gyro bias over temperature")
     terms += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
