@@ -178,6 +178,21 @@ def test_headers_without_stamps_and_stamps_out_of_order_are_said(bag):
     )
 
 
+@pytest.mark.parametrize("format", ["bag", "mcap"])
+def test_a_clock_that_was_set_back_is_refused_and_late_messages_are_not(bag, format):
+    """Sorted, the messages before and after the step would alternate; late ones fill the hole that they left."""
+    _, content = imu()
+    late = read(bag(format, content[:10] + content[20:30] + content[10:20] + content[30:], name="late"))
+    np.testing.assert_array_equal(late.rate, read(bag(format, content)).rate)
+    step = 52_000_000
+    set_back = content[:20] + [(topic, kind, stamp - step, *rest) for topic, kind, stamp, *rest in content[20:]]
+    with pytest.raises(
+        InputError,
+        match=r"topic /imu/data: the clock goes back by 0.047 s at message 21, and 10 messages .* cut the bag",
+    ):
+        read(bag(format, set_back, name="step"))
+
+
 def test_equal_stamps_are_not_out_of_order(bag):
     """Of a gyro they are refused, by their own name; of a magnetometer the sample is taken."""
     _, content = imu()

@@ -55,6 +55,8 @@ ORIENTED = {IMU: (0, 13), ODOMETRY: (3, 43), POSE_COVARIANCE: (3, 43), POSE: (3,
 TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperature", REFERENCE: "/imu/reference"}
 """Topics that are written, with the names of REP 145."""
 WITH_ORIENTATION = "/imu/data"
+MAX_LATE = 5
+"""Maximum number of messages in a row that are late and alternate with others in order of time."""
 FRAME = "imu_link"
 
 
@@ -80,6 +82,7 @@ class Topic:
             remarks.append(f"The headers of {self.name} have no stamps: time is that of the recorder.")
         back = np.diff(stamps) < 0
         if back.any():
+            _refuse_repeated_time(f"{source}, topic {self.name}", stamps)
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
             remarks.append(
@@ -90,6 +93,21 @@ class Topic:
     def __len__(self) -> int:
         """Return the number of messages."""
         return len(self.logged)
+
+
+def _refuse_repeated_time(place: str, stamps: NDArray[np.int64]) -> None:
+    """Reject a clock that was set back: messages before and after it alternate in order of time, while late ones fill a hole."""
+    latest = np.maximum.accumulate(stamps)
+    behind = np.concatenate([[False], stamps < latest, [False]])
+    for first, end in np.flatnonzero(np.diff(behind)).reshape(-1, 2).tolist():
+        late = stamps[first:end]
+        between = np.sum((stamps[:first] > late[0]) & (stamps[:first] < late.max())) if end - first > MAX_LATE else 0
+        if between > MAX_LATE:
+            back = (latest[first] - late[0]) / 1e9
+            raise InputError(
+                f"{place}: the clock goes back by {back:.6g} s at message {first + 1}, and {len(late)} messages repeat times before it; "
+                "cut the bag there (`rosbag filter`, `mcap filter`)"
+            )
 
 
 # ----------------------------------------------------------------------------------------------------------- reading
