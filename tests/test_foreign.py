@@ -256,6 +256,8 @@ def test_a_bag_has_the_attitude_about_fixed_axes(replayed, files, command):
     topics = "/imu/data,/imu/reference"
     both = command("check", files / "estimate.mcap", "--truth", files / "estimate.mcap", "--topic", topics)
     assert (both[0], "Truth: estimate.mcap" in both[1]) == (status, True), both
+    of_truth = ("--truth", files / "estimate.mcap", "--topic", "/imu/reference")
+    assert "Truth: estimate.mcap" in command("check", files / "estimate.tum", *of_truth)[1]
     e, t = replayed.estimate, replayed.record.truth
     cut = slice(1, None)
     alone = consistency.judge(

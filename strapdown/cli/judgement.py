@@ -20,7 +20,9 @@ class _Foreign:
     """With a truth: an estimate of any filter."""
 
     truth: Path | None = Option(None, help="Reference attitudes, any clock and frames: TUM, EuRoC, BROAD, CSV, bag.")
-    topic: str = Option("", help="Topic of the estimate, if a bag has several, or of both: ESTIMATE,TRUTH.")
+    topic: str = Option(
+        "", help="Topic of the bag, if it has several; of two bags: of the estimate, or ESTIMATE,TRUTH."
+    )
     error_frame: str = Option("find", help="Frame of the covariance: body, fixed or euler; find: by the errors.")
     align: str = Option(
         "auto",
@@ -89,7 +91,8 @@ def check(
 
 def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
-    topic, _, true_topic = options.topic.partition(",")
+    of_estimate = "," in options.topic or sd.recordings.formats.format_of(result).name == "ROS bag"
+    topic, _, true_topic = options.topic.partition(",") if of_estimate else ("", "", options.topic)
     own = sd.read_attitudes(result, topic=topic)
     truth = None if options.truth is None else sd.read_attitudes(options.truth, topic=true_topic)
     checked = sd.consistency.check_attitudes(own, truth, error_frame=options.error_frame, align=options.align, **how)
