@@ -565,6 +565,29 @@ def test_a_steady_turn_about_the_vertical_is_no_rest_after_one(turn):
     np.testing.assert_array_equal(last, [k for k in range(9, 600, 10) if k // 200 != 1])
 
 
+def panning(turn: float, field_turn: float) -> Recording:
+    """A unit with a bias of 0.05 °/s that turns about the vertical from 20 s on, and a field that turns in its axes, °/s."""
+    since = np.maximum(0.1 * np.arange(1, 2001) - 20.0, 0.0)
+    up = np.array([0.0, 0.0, 1.0])
+    field = quaternion.rotate(quaternion.exp(-field_turn * DEGREE * since[:, None] * up), [0.0, 20.0, -43.0])
+    field += 0.1 * np.random.default_rng(1).standard_normal(field.shape)
+    rate = (0.05 + turn * (since > 0.0)) * DEGREE
+    return dataclasses.replace(lying(200, rate), magnetic_field=field, magnetic_unit="uT")
+
+
+@pytest.mark.parametrize("turn", [0.15, 0.2, -0.2])
+def test_a_slow_turn_with_which_the_field_turns_is_no_rest(turn):
+    """No second of it differs from a rest. That the field turns at a rest is a disturbance."""
+    last = rests_of(panning(turn, turn)).last
+    assert np.sum(last < 200) == 20
+    assert last[-1] < 200 + 10 * starting.FIELD_TIME
+    assert len(rests_of(panning(0.0, 0.5)).last) == 200
+    result = ahrs.estimate(panning(turn, turn)).estimate
+    nose = quaternion.rotate(result.attitude[[0, -1]], [1.0, 0.0, 0.0])
+    turned = np.diff(np.arctan2(nose[:, 1], nose[:, 0]))[0] / DEGREE
+    assert turned == pytest.approx(180.0 * turn, abs=2.0)
+
+
 def test_after_a_first_rest_in_a_steady_turn_the_true_ones_are_used():
     assert rests_of(lying(40, 5.0 * DEGREE * (np.arange(400) < 200))).last[-1] == 399
 

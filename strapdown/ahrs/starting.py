@@ -31,6 +31,8 @@ TURNING_RATE = 0.3 * DEGREE
 """Mean rate, rad/s, above which vertical and field are examined for a rotation with it."""
 TURN_ODDS = 5.0
 """Difference of a mean rate from the bias by the rests before, relative to its σ, above which it is a turn."""
+FIELD_TURN, FIELD_TIME = 0.5 * DEGREE, 15.0
+"""Turn of the field with the gyro, rad, in that time, s, above which a unit that seems at rest turns slowly."""
 FIRST_BIAS_SIGMA = 2.0 * DEGREE
 """Its σ before the first rest, rad/s, without a magnetometer too."""
 FIRST_ALIGNMENT, LAST_ALIGNMENT = 0.0625, 1.0
@@ -293,6 +295,8 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
         walk=walk,
         unmodelled=walk - modelled,
         slow_walk=SLOW_DRIFT**2,
+        field_turn=FIELD_TURN**2,
+        field_time=FIELD_TIME,
     )
 
 
@@ -302,14 +306,15 @@ def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
         tenths=np.zeros((rest_length(interval)[0], 4)),
         halves=np.zeros((4, 3)),
         halves_number=np.zeros(4, np.int64),
-        resting=np.zeros(2, np.int64),
+        resting=np.zeros(3, np.int64),
         rest_rate=np.zeros((1, 3)),
         rest_variance=np.array([np.inf]),
         rest_gained=np.array([np.inf]),
         rest_bias=np.zeros((1, 3)),
         bias_variance=np.array([parameters.bias_sigma**2]),
         plausible_variance=np.array([FIRST_BIAS_SIGMA**2]),
-        rest_clock=np.zeros(2),
+        rest_clock=np.zeros(3),
+        field_before=np.zeros((1, 3)),
     )
 
 

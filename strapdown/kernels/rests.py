@@ -38,6 +38,10 @@ class Constants(NamedTuple):
     """The part of it that the filter does not model."""
     slow_walk: float
     """The part of it that is not mistaken for a slow turn."""
+    field_turn: float
+    """Squared turn of the field, rad², above which a unit that seems at rest turns slowly."""
+    field_time: float
+    """Time over which such a turn is looked for, s."""
 
 
 class Memory(NamedTuple):
@@ -50,7 +54,7 @@ class Memory(NamedTuple):
     halves_number: np.ndarray
     """Number of samples in the halves (4,)."""
     resting: np.ndarray
-    """Number of samples in the span; 1: it was a rest that shows more of the bias than is known, 2: the next step begins with it (2,)."""
+    """Number of samples in the span; 1 if it shows more of the bias, 2 if the next step begins with it; 1 after a slow turn (3,)."""
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
@@ -64,7 +68,9 @@ class Memory(NamedTuple):
     plausible_variance: np.ndarray
     """That of the bias by all rests, at first that of any unit: a mean rate that departs by more is a turn (1,)."""
     rest_clock: np.ndarray
-    """Time of the first sample of the span, and of the last rest, s (2,)."""
+    """Time of the first sample of the span, of the last rest, and of that of ``field_before``, s (3,)."""
+    field_before: np.ndarray
+    """Direction of the field in an earlier span at rest, zero if the unit has moved since, or if there is no field (1, 3)."""
 
 
 class Means(NamedTuple):
@@ -138,7 +144,7 @@ def find_rest(constants, time, memory):
 
     The variance of its mean rate is that of a unit at rest and the spread of the rate between the parts, which is motion of the hand. A
     span with a gap is no rest, nor one with which the vertical or the field rotates, nor one that is faster than a bias that the rests
-    before leave possible: a steady turn is no bias.
+    before leave possible: a steady turn is no bias. Nor is a rate with which the field turns slowly.
     """
     parts, part = constants.parts, constants.part
     rate = (0.0, 0.0, 0.0)
@@ -161,13 +167,16 @@ def find_rest(constants, time, memory):
     turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
     with_force, square_force = turned_with(constants, rate, memory, 0)
     with_field, square_field = turned_with(constants, rate, memory, 2)
-    still = (
+    quiet = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
         and 2.0 * covered > parts
         and not turns
         and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
     )
+    if variance >= constants.max_variance:
+        store_row(memory.field_before, 0, (0.0, 0.0, 0.0))
+    still = quiet and not turns_slowly(constants, rate, change, time, memory)
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
     memory.rest_gained[0] = math.inf
@@ -178,6 +187,36 @@ def find_rest(constants, time, memory):
         memory.bias_variance[0] = 1.0 / (1.0 / known + 1.0 / variance)
         memory.plausible_variance[0] = 1.0 / (1.0 / plausible + 1.0 / variance)
         store_row(memory.rest_bias, 0, combine(1.0, bias, plausible / (plausible + variance), change))
+
+
+def turns_slowly(constants, rate, change, time, memory):
+    """Return whether the field shows that a unit that seems at rest turns, so slowly that no second shows it: its rate is no bias.
+
+    The field is compared with that of a span up to two times ``field_time`` before; its turn must be that of the rate, or of the change of
+    the rate since the rests before. Once it has turned, its next span must not.
+    """
+    before, since = vector_at(memory.field_before, 0), time - memory.rest_clock[2]
+    field = combine(1.0, vector_at(memory.halves, 2), 1.0, vector_at(memory.halves, 3))
+    size = math.sqrt(dot(field, field))
+    if size > 0.0:
+        field = combine(1.0 / size, field, 0.0, field)
+    compared = dot(before, before) > 0.0 and size > 0.0
+    turned = turned_by(constants, rate, since, before, field) or turned_by(constants, change, since, before, field)
+    due = since >= constants.field_time
+    turns = compared and (turned or (memory.resting[2] == 1 and not due))
+    if due or not compared:
+        store_row(memory.field_before, 0, field)
+        memory.rest_clock[2] = time
+        memory.resting[2] = 1 if turns else 0
+    return turns
+
+
+def turned_by(constants, rate, since, before, field):
+    """Return whether a direction has turned by more than ``field_turn`` and by as much as with a mean rate, to within a half."""
+    change = combine(1.0, field, -1.0, before)
+    expected = cross(rate, combine(-0.5 * since, field, -0.5 * since, before))
+    square = dot(change, change)
+    return square > constants.field_turn and dot(change, expected) > 0.5 * max(square, dot(expected, expected))
 
 
 def turned_with(constants, rate, memory, first):
