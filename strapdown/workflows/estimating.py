@@ -85,8 +85,9 @@ def estimate(
     robust : Robust or {"huber", "student"}, optional
         Weight measurements by the size of their innovations.
     motion : {"hand", "vehicle", "vessel", "any"}, optional
-        For a recording: model of the motion. ``"hand"``, the default: bounded velocity, as of a hand, a person or a small aircraft;
-        ``"vehicle"``: acceleration that lasts for seconds; ``"vessel"``: bounded position, as on waves; ``"any"``: white noise.
+        For a recording: model of the motion. ``"hand"``, the default: bounded velocity, as of a hand, a person or a small aircraft
+        in a room; ``"vehicle"``: acceleration that lasts for seconds, also of a drone outdoors; ``"vessel"``: bounded position, as on
+        waves; ``"any"``: white noise.
     latency : float, optional
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
