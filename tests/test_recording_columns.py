@@ -253,8 +253,8 @@ def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
     guessed = table("t,GyrX [dps],GyrY,GyrZ,AccX [g],AccY,AccZ", values=values)
     odd = table("t,u1,u2,u3,f1,f2,f3", values=values, name="odd.csv")
     mapping = "time=t,gx=u1[dps],gy=u2,gz=u3,ax=f1[g],ay=f2,az=f3"
-    for command in ("estimate", "integrate", "doctor"):
-        out = ["--out", str(tmp_path / f"{command}.h5")] if command != "doctor" else []
+    for command, name in {"estimate": "estimate", "integrate": "integrate.h5", "doctor": ""}.items():
+        out = ["--out", str(tmp_path / name)] if name else []
         said = CliRunner().invoke(app, [command, str(guessed), *out])
         assert "Columns assigned by their names: time from 't'" in said.output, said.output
         other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
