@@ -148,6 +148,29 @@ def test_missing_motion_is_said():
     assert delay.endswith("σ of magnetometer delay is 6 ms, good is 3.")
 
 
+def test_acceleration_that_lasts_is_no_error_of_a_unit(turned):
+    """A multirotor in flight, whose specific force is along its z axis however it tilts, and a unit without errors."""
+    random, time = np.random.default_rng(1), np.arange(6000) / 100.0
+
+    def attitude(t):
+        yaw = 0.3 * t + 0.5 * np.sin(0.3 * t)
+        return Rotation.from_euler("ZYX", np.stack([yaw, 0.35 * np.sin(0.7 * t + 1.0), 0.35 * np.sin(0.5 * t)], -1))
+
+    rate = (attitude(time - 1e-3).inv() * attitude(time + 1e-3)).as_rotvec() / 2e-3
+    thrust = 9.80665 / attitude(time).inv().apply([0.0, 0.0, 1.0])[:, 2]
+    flight = Recording(
+        source="flight",
+        time=time,
+        rate=rate + 2e-3 * random.standard_normal(rate.shape),
+        specific_force=np.outer(thrust, [0.0, 0.0, 1.0]) + 0.05 * random.standard_normal(rate.shape),
+        magnetic_field=attitude(time).inv().apply([0.0, 20.0, -43.0]) + 0.3 * random.standard_normal(rate.shape),
+        magnetic_unit="uT",
+    )
+    first = sd.calibrate(flight).remarks[0]
+    assert first.startswith("Do not use this calibration: its accelerometer scale y of -3.7 % is that of no unit")
+    assert not any("Do not use" in remark for remark in turned[2].remarks)
+
+
 def test_an_interval_begins_with_the_sample_after_its_edge():
     """A rate and a force that grow with the time: its integral by the trapezium, which is exact for it, and every sample once."""
     time, edges = np.arange(41) / 16.0, [0, *range(3, 40, 4), 40]

@@ -33,6 +33,12 @@ def test_satellites_are_in_free_fall(name):
     assert load_scenario(name).gravity_f == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("value", ["star", ("star",), (vectors.AttitudeSensor,)])
+def test_what_is_no_sensor_is_refused(value):
+    with pytest.raises(InputError, match=r"^a sensor is .*; give sensors, such as VectorSensor"):
+        dataclasses.replace(load_scenario("two-stars"), sensors=value)
+
+
 @pytest.mark.parametrize("value", ["slew", motion.Coning])
 def test_what_is_no_motion_is_refused(value):
     with pytest.raises(InputError, match=r"^motion is .*(slew|Coning).*; give a motion, such as motion\.rest"):

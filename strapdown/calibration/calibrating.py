@@ -30,6 +30,8 @@ AVERAGED = 2.0
 """Duration before and after a node over which vertical and field are averaged for its initial attitude, s."""
 MOVED_RATE = 0.1
 """Spread of the rate, rad/s, above which no second of a part is treated as a rest."""
+PLAUSIBLE = 3.5
+"""Largest plausible error of a unit, relative to the prior σ. Of 15 recordings of four public sets, units in the hand have up to 3.2."""
 WANTED = {
     "gyro_bias": 0.05 * DEGREE,
     "gyro_matrix": 2e-3,
@@ -214,7 +216,25 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
         magnetic_unit=recordings[0].magnetic_unit if len(prior.mean) > fitting.IRON.start else "",
         source=", ".join(dict.fromkeys(recording.source for recording in recordings)),
     )
-    return replace(unit, remarks=missing(unit, strength))
+    return replace(unit, remarks=(*implausible(unit), *missing(unit, strength)))
+
+
+def implausible(calibration: UnitCalibration) -> tuple[str, ...]:
+    """Return the largest of the errors of gyro and accelerometer that no unit has: acceleration that lasts is mistaken for them."""
+    prior = {
+        "gyro_matrix": GYRO_SIGMA,
+        "accelerometer_bias": FORCE_BIAS_SIGMA,
+        "accelerometer_matrix": FORCE_SIGMA,
+    }
+    errors = [(name, axes, error) for name, axes, error in calibration.entries() if name in prior]
+    name, axes, worst = max(errors, key=lambda entry: abs(entry[2]) / prior[entry[0]])
+    if abs(worst) <= PLAUSIBLE * prior[name]:
+        return ()
+    words, unit, factor = printed(name, axes, calibration.magnetic_unit)
+    return (
+        f"Do not use this calibration: its {words} of {worst / factor:.2g} {unit} is that of no unit; acceleration that lasts, "
+        "as in a flight or a vehicle, was mistaken for it. Turn the unit by hand, in one place.",
+    )
 
 
 def missing(calibration: UnitCalibration, strength: float = 1.0) -> tuple[str, ...]:

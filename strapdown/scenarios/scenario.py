@@ -125,6 +125,9 @@ class Scenario(ByValue):
             raise InputError(f"motion is {self.motion!r}; give a motion, such as motion.rest() or motion.Coning(…)")
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
+        for sensor in self.sensors:
+            if isinstance(sensor, type) or not hasattr(sensor, "name"):
+                raise InputError(f"a sensor is {sensor!r}; give sensors, such as VectorSensor(…) or AttitudeSensor(…)")
         names = [sensor.name for sensor in self.sensors]
         for name in names:
             if not str(name).strip():
