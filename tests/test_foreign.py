@@ -766,6 +766,21 @@ def test_at_a_constant_rate_a_far_frame_is_no_offset_of_the_clock():
     )
 
 
+@pytest.mark.parametrize("steady", [True, False])
+def test_an_offset_of_the_clock_that_may_be_a_rotation_is_said_to_be(steady):
+    time, late = np.arange(0.0, 300.0, 0.5), 0.35
+    if steady:
+        of, true = (quaternion.exp(np.outer(t, np.array([0.1, -0.2, 0.5]) * DEGREE)) for t in (time, time + late))
+    else:
+        of, true = (FLIGHT.motion.attitude(t) for t in (time, time + late))
+    own, truth = alignment.Series(time + late, of), alignment.Series(time + late, true)
+    a = alignment.fit(own, truth, ("time", "fixed"), 0.0)
+    assert a.ambiguous == steady
+    assert ("at a constant rate a rotation of the frames would look the same" in a.words[0]) == steady
+    if not steady:
+        assert a.offset == pytest.approx(-late, abs=2e-3)  # the attitudes between the stamps are interpolated
+
+
 def test_the_first_errors_of_a_filter_do_not_decide_its_alignment():
     """σ of 6° for two seconds and 0.006° for five minutes: unweighted, σ of the frame would be 57 times as large."""
     time = np.arange(0.0, 300.0, 0.5)

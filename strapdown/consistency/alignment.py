@@ -24,6 +24,8 @@ GROSS = 5.0 * DEGREE
 """A constant rotation above this is a difference of frames and not an error of a filter, rad."""
 LONGEST_OFFSET = 30.0
 """Maximum offset of the clocks to search for if the records overlap without one, s."""
+AMBIGUOUS = 0.1
+"""Component of the offset, scaled to unit information, in an undetermined direction, above which that is said."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,6 +44,8 @@ class Alignment:
     """Which of :data:`ALIGNED` were estimated and removed."""
     residual: float
     """RMS of the remaining angle, rad."""
+    ambiguous: bool = False
+    """Whether the motion does not distinguish the offset of the clock from a rotation of the frames; σ is that of what it determines."""
 
     @property
     def sigma(self) -> Array:
@@ -69,6 +73,7 @@ class Alignment:
             digits = max(6.0, 2.0 + np.ceil(np.log10(max(abs(self.offset), 1e-9) / max(self.sigma[6], 1e-9))))
             words.append(
                 f"clocks differ by {self.offset:.{int(digits)}g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
+                + ("; at a constant rate a rotation of the frames would look the same" if self.ambiguous else "")
             )
         for name, rotation, rows in (("fixed", self.fixed, slice(0, 3)), ("body", self.body, slice(3, 6))):
             if name in self.estimated:
@@ -245,7 +250,7 @@ def _descended(
     own: Series, theirs: Series, names: tuple[str, ...], fixed: Array, body: Array, offset: float
 ) -> Alignment:
     free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
-    covariance = np.zeros((7, 7))
+    covariance, ambiguous = np.zeros((7, 7)), False
     common = min(own.time[-1] + offset, theirs.time[-1]) - max(own.time[0] + offset, theirs.time[0])
     near = offset + np.array([-1.0, 1.0]) * min(LONGEST_OFFSET, 0.5 * common)  # half of the common time remains common
     for _ in range(20):
@@ -260,6 +265,7 @@ def _descended(
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         value, vector = np.linalg.eigh(information * np.outer(scale, scale))
         determined = value > 1e-6 * value[-1]  # directions that the motion does not determine are left unchanged
+        ambiguous = bool(free[6] and np.abs(vector[-1, ~determined]).max(initial=0.0) > AMBIGUOUS)
         inverse = (vector[:, determined] / value[determined]) @ vector[:, determined].T * np.outer(scale, scale)
         step = np.zeros(7)
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
@@ -283,6 +289,7 @@ def _descended(
         covariance=covariance,
         estimated=tuple(name for name in ALIGNED if name in names),
         residual=float(np.sqrt(np.mean(np.sum((left / weight) ** 2, axis=1)))),
+        ambiguous=ambiguous,
     )
 
 
