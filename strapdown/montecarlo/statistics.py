@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import consistency, estimation, units
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, are_finite
 from strapdown.consistency import Finding, Judgement, Verdict
 from strapdown.consistency.bounds import coverage_p_values, log_mean_p_value, tail
 from strapdown.consistency.judgement import (
@@ -89,7 +89,7 @@ class Replay:
         assert truth is not None
         rows = np.searchsorted(estimate.time, np.asarray(epochs) + 1e-9, side="right") - 1
         q, P = estimate.attitude[rows], estimate.covariance[rows, :size, :size]
-        good = np.isfinite(np.c_[q, P.reshape(len(q), -1)]).all(axis=1)
+        good = are_finite(np.c_[q, P.reshape(len(q), -1)])
         good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
         nees, kept = np.full(len(rows), np.inf), rows[good]
         bias = np.nan_to_num(estimate.bias[kept])
@@ -534,11 +534,12 @@ def _odd_runs(statistics: Statistics) -> str:
     from scipy.special import chdtrc
 
     column, degrees = SUBSETS[statistics.subsets[0]]
-    score = statistics.worst_score[np.isfinite(statistics.worst_score), None]
-    others = (statistics.nees_sum[:, column] - score) / (degrees * np.maximum(statistics.finite - 1, 1))
-    relative = score[:, 0] / others.max(axis=1, initial=1.0)
+    known = np.isfinite(statistics.worst_score)
+    score = statistics.worst_score[known]
+    others = (statistics.nees_sum[:, column] - score[:, None]) / (degrees * np.maximum(statistics.finite - 1, 1))
+    relative = score / others.max(axis=1, initial=1.0)
     odd = statistics.runs * len(statistics.time) * chdtrc(degrees, relative) < ODD
-    runs = zip(statistics.worst_run[np.isfinite(statistics.worst_score)][odd], score[odd, 0], strict=True)
+    runs = zip(statistics.worst_run[known][odd], score[odd], strict=True)
     names = ", ".join(f"run {run} (NEES {figure(float(value), 3)})" for run, value in runs)
     seed = "" if statistics.plan is None else f" of seed {statistics.plan.seed}"
     return f"{names}{seed} beyond all chance (p < {ODD:g} over all runs and epochs)" if names else ""
