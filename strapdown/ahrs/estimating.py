@@ -321,7 +321,7 @@ def _at_stamps(
     """
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = (np.empty((n, width)) for width in (4, 3, 6))
-    P = np.empty((n if options.full_covariance else 0, 6, 6))
+    P = np.empty((n if options.full_covariance else 0, 36))
     ahead = -sensor_delays.turn_over(used, -delays.gyro) if options.smooth else used.rate * delays.gyro
     interval = max(parameters.step, used.interval)
     scales = regions.scales(filtered, density, parameters, causal=not options.smooth)
@@ -352,7 +352,7 @@ def _at_stamps(
         attitude=attitude,
         bias=bias,
         variance=variance,
-        covariance=P if options.full_covariance else None,
+        covariance=P.reshape(-1, 6, 6) if options.full_covariance else None,
         innovations=regions.scaled_innovations(filtered, level),
         skipped=prepared.skipped,
         events=filtered.events,

@@ -131,7 +131,7 @@ class LiveAhrs:
         parameters, step = self.parameters, max(self.parameters.step, self.interval)
         constants = headings.constants_of(parameters, step)
         self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
-        self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
+        self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (36,))))
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
         time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
         imu = kernel.Imu(
@@ -359,7 +359,7 @@ class LiveAhrs:
     @property
     def covariance(self) -> Array:
         """Covariance of these errors (6, 6)."""
-        return np.array(self._found.covariance[1])
+        return self._found.covariance[1].reshape(6, 6).copy()
 
 
 def arrays_of(

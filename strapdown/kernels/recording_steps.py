@@ -12,6 +12,7 @@ from strapdown.kernels.algebra import (
     full,
     multiply,
     scale,
+    scale_matrix,
     symmetric_minus_outer,
     times_transpose_upper,
     transpose,
@@ -21,7 +22,7 @@ from strapdown.kernels.integration import large_exponential
 from strapdown.kernels.lane_values import WIDTH, broadcast, load
 from strapdown.kernels.measurement import quaternion_at, vector_at
 from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, renormalized, rotation_matrix
-from strapdown.kernels.state import store_row, store_several
+from strapdown.kernels.state import keep_state, store_row, store_several
 
 
 def follow_gyro(time, rate, attitude):
@@ -175,7 +176,7 @@ class Carried(NamedTuple):
     variance: np.ndarray
     """(n, 6)"""
     covariance: np.ndarray
-    """(n, 6, 6), or (0, 6, 6)."""
+    """By rows (n, 36), or (0, 36)."""
 
 
 def block_at(P, first):
@@ -241,6 +242,7 @@ def carry_to_stamps(steps, stamps, limits, out):
         first_row, second_row = across[:3], across[3:6]
         level_rows = combine(b * sx, first_row, b * sm, second_row) + combine(b * sm, first_row, b * sy, second_row)
         across = level_rows + scale(b * h, across[6:])
+        bias_covariance = scale_matrix(b * b, (P[3, 3], P[3, 4], P[3, 5], P[4, 4], P[4, 5], P[5, 5]))
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
@@ -249,20 +251,8 @@ def carry_to_stamps(steps, stamps, limits, out):
             R = rotation_matrix(q)
             own = times_transpose_upper(multiply(transpose(R), fixed), transpose(R))
             w = vector_at(stamps.rate, n)
-            own = full(symmetric_minus_outer(own, scale(-limits.timing, w), w))
-            store_row(out.attitude, n, q)
-            store_row(out.bias, n, bias)
-            store_row(out.variance, n, (own[0], own[4], own[8]))
-            for i in range(3, 6):
-                out.variance[n, i] = b * b * steps.variance[k, i]
-            if n < len(out.covariance):
-                mixed = multiply(transpose(R), across)
-                for i in range(3):
-                    for j in range(3):
-                        out.covariance[n, i, j] = own[3 * i + j]
-                        out.covariance[n, i, 3 + j] = mixed[3 * i + j]
-                        out.covariance[n, 3 + j, i] = mixed[3 * i + j]
-                        out.covariance[n, 3 + i, 3 + j] = b * b * P[3 + i, 3 + j]
+            own = symmetric_minus_outer(own, scale(-limits.timing, w), w)
+            keep_state(out, n, q, bias, own, multiply(transpose(R), across), bias_covariance)
 
 
 class Scales(NamedTuple):
