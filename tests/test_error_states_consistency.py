@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from measured import FIELD, HAND, beside_silent, drawn_start, series_of, state_errors
 
-from strapdown import consistency, estimation, gyro, quaternion
+from strapdown import consistency, estimation, gyro, motion, quaternion, workflows
 from strapdown.estimation import error_states
 from strapdown.estimation.observability import state_names
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
@@ -235,3 +237,32 @@ def test_calibration_is_found(case):
         assert np.all(np.abs(error) < 4.0 * state.sigma[-1])
         assert np.all(state.sigma[-1] < 0.25 * block.sigma)
         assert np.linalg.norm(error) < 0.25 * np.linalg.norm(run.truth[block.name])
+
+
+def test_a_start_from_measurements_includes_the_errors_of_the_sensors_that_are_states():
+    """With biases of fifteen times the noise, the attitude after the first measurements has the covariance that they leave."""
+    nees, field = [], np.array([0.0, 2e-5, -4e-5])
+    deviation = {"force": 0.03, "mag": 0.03}
+    states = States(sensors={name: SensorStates(bias_sigma=sigma) for name, sigma in deviation.items()})
+    noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+    setup = FilterSetup(process_noise=noise, attitude_sigma=0.1, bias_sigma=1e-3, states=states)
+    for seed in range(24):
+        bias, iron = generator(seed, 0, "biases").standard_normal((2, 3))
+        sensors = (
+            Accelerometer(name="force", rate=20.0, sigma=0.02, bias=9.80665 * deviation["force"] * bias),
+            Magnetometer(
+                name="mag",
+                rate=20.0,
+                field_f=field,
+                sigma=9e-8,
+                hard_iron=deviation["mag"] * np.linalg.norm(field) * iron,
+            ),
+        )
+        spec = gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6, turn_on_bias_sigma=1e-3)
+        resting = Scenario(motion=motion.rest(), gyro=spec, sensors=sensors, rate=100.0, duration=2.5)
+        record = simulate(resting, seed)
+        estimate = workflows.estimate(record, setup=setup)
+        k = int(np.searchsorted(estimate.time, 0.055))
+        error = quaternion.rotation_between(estimate.attitude[k], record.truth.attitude[k])
+        nees.append(error @ np.linalg.solve(estimate.covariance[k, :3, :3], error))
+    assert 0.5 < np.mean(nees) / 3.0 < 1.7  # 72 degrees of freedom: 99.9 % of right filters

@@ -359,7 +359,7 @@ class LiveAhrs:
     @property
     def covariance(self) -> Array:
         """Covariance of these errors (6, 6)."""
-        return self._found.covariance[1].reshape(6, 6).copy()
+        return np.array(self._found.covariance[1].reshape(6, 6))
 
 
 def arrays_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,9 @@ from strapdown.checks import Hint, InputError
 from strapdown.estimation import multiple_model, setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import PRIOR_INFLATION, State
-from strapdown.records import ImuRecord, Origin
+from strapdown.records import ImuRecord, Origin, cut
 from strapdown.units import DEGREE
+from strapdown.vectors import VectorMeasurements
 from strapdown.vectors.wahba import InconsistentError
 
 UNEVEN = 2.0
@@ -38,8 +40,15 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
     the attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
     (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where its hypotheses are merged into one.
     """
+    noise, bias_sigma = filter_setup.process_noise, filter_setup.bias_sigma
     try:
-        state = estimation.first_state(record, filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma)
+        if filter_setup.states is None:
+            state = estimation.first_state(record, noise, bias_sigma=bias_sigma)
+        else:
+            rough = replace(record, vectors=tuple(series.noise_scaled(ROUGH) for series in record.vectors))
+            state = estimation.first_state(rough, noise, bias_sigma=bias_sigma)
+            with_errors = _with_sensor_errors(record, filter_setup, state)
+            state = estimation.first_state(with_errors, noise, bias_sigma=bias_sigma)
     except InconsistentError as error:
         problem = _without_remedy(error)
         # With a sensor's errors among the states, the filter can estimate them.
@@ -54,6 +63,33 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
         )
     again = f"with {PRIOR_INFLATION:g} times their σ, since the filter uses them again"
     return Start(state, f"Started from the first measurements {again}: σ {_sigma_words(state)}.")
+
+
+ROUGH = 10.0
+"""Factor on the σ of measurements whose sensors have errors that are states, for an attitude that shows how large these may be."""
+KNOWN = 1e-12
+"""Share of the variances of attitude and bias of a filter whose innovations show the errors of the sensors only."""
+MIN_SAMPLES = 200
+"""Minimum number of gyro samples for its angular acceleration, which a lever arm needs."""
+
+
+def _with_sensor_errors(record: ImuRecord, filter_setup: FilterSetup, state: State) -> ImuRecord:
+    """Return the record with the σ that its measurements have before the filter has estimated any error of the sensors.
+
+    It is that of the first innovation of a filter whose attitude and bias are known.
+    """
+    last = max(np.searchsorted(record.time, series.time[:1]).sum() for series in record.vectors) + 1
+    part = cut(record, 0, min(max(last, MIN_SAMPLES), len(record.increments)))
+    known = replace(state, covariance=KNOWN * state.covariance)
+    innovations = setup.run_modelled(part, filter_setup, known, gate=None, robust=None).innovations
+
+    def widened(series: VectorMeasurements) -> VectorMeasurements:
+        variance = innovations[series.sensor].variance[:1]
+        length = np.linalg.norm(series.references_f[:1]) if series.kind == "vector" else 1.0
+        noise = np.einsum("kii->", series.covariances[:1]) / (3.0 * length**2)
+        return series.noise_scaled(max(1.0, float(np.sqrt(variance.max() / noise)))) if len(variance) else series
+
+    return replace(record, vectors=tuple(map(widened, record.vectors)))
 
 
 def _without_remedy(error: InputError) -> str:
