@@ -380,6 +380,16 @@ def test_what_is_specified_is_known_and_not_likely():
     assert "One of these causes, which the data do not distinguish" in unknown.cause_words
 
 
+def test_a_cause_is_known_of_the_sensor_for_which_it_is_specified():
+    """Not of one whose name is the beginning of that sensor's name."""
+    scene = scenario(star={"name": "mag 2", "faults": vectors.Faults(outlier_probability=0.05)}, duration=20.0)
+    first, second = scene.sensors
+    record = scenarios.simulate(replace(scene, sensors=(replace(first, name="mag"), second)), seed=1)
+    considered = diagnosis.diagnose(record, RIGHT, start(record, RIGHT, 1, 0)).considered
+    outliers = {cause.of: cause.known for cause in considered if cause.name == "outliers"}
+    assert outliers == {"mag": False, "mag 2": True}
+
+
 # ------------------------------------------------------------------------------------------------------------- one of these causes
 
 

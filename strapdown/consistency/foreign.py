@@ -33,7 +33,7 @@ from strapdown.consistency.bounds import mean_p_value
 from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge, mark
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
-from strapdown.estimation.setup import LATE, from_toml
+from strapdown.estimation.setup import from_toml, unmodelled
 from strapdown.records import Estimate, Innovations, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
@@ -232,7 +232,9 @@ def check_attitudes(
         details={"truth": truth.source},
     )
     judgement = judge(estimate, **how)
-    late = any(what.startswith(LATE) for what in judgement.unmodelled)
+    late = any(
+        (error.of, error.name) == ("gyro", "time offset") for error in unmodelled(estimate.origin, estimate.setup)
+    )
     explained = tuple(
         replace(e, known=late if e.name == CLOCK else e.name == SCALE and bool(own.motion) and float(e.value) < 1.0)
         for e in explained

@@ -126,8 +126,8 @@ def diagnose(
     P = np.diag(result.variance[0]) if result.covariance is None else result.covariance[0]
     initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
-    used = accepted(record, result)
-    judgement = judgement or check(replace(result, origin=record.origin or result.origin))
+    used = replace(accepted(record, result), origin=record.origin or result.origin)
+    judgement = judgement or check(replace(result, origin=used.origin))
     causes = diagnosis.diagnose(used, filter_setup, initial, judgement=judgement)
     if filter_setup.robust is not None:
         return causes, "The filter weights measurements by their innovations, and the search for causes does not"

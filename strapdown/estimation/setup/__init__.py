@@ -37,9 +37,9 @@ from strapdown.estimation.setup.running import run_modelled as run_modelled
 from strapdown.estimation.setup.running import smooth_modelled as smooth_modelled
 from strapdown.estimation.setup.running import with_sigma as with_sigma
 from strapdown.estimation.setup.states import SensorStates, States
-from strapdown.estimation.setup.unmodelled import LATE as LATE
 from strapdown.estimation.setup.unmodelled import remedy as remedy
 from strapdown.estimation.setup.unmodelled import specified_errors as specified_errors
+from strapdown.estimation.setup.unmodelled import unmodelled as unmodelled
 from strapdown.estimation.setup.unmodelled import unmodelled_errors as unmodelled_errors
 from strapdown.estimation.setup.unmodelled import unmodelled_words as unmodelled_words
 

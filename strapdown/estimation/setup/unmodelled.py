@@ -16,7 +16,6 @@ from strapdown.records import Origin
 if TYPE_CHECKING:
     from strapdown.estimation.setup.filter_setup import FilterSetup
 
-LATE = "the gyro's time stamps, late"
 REJECTION = "gate or robust weights"
 DIFFERENT_AXES = 1.2
 """Ratio of the noises of two axes of a gyro above which it is reported that a filter has only one for all axes."""
@@ -31,17 +30,33 @@ _NOISES = {
 class SpecifiedError(NamedTuple):
     """A specified error of gyro or sensor beside white noise and random walks."""
 
+    of: str
+    """"gyro", or the sensor."""
+    name: str
+    """Name that, with ``of``, a cause of the same error has (:class:`strapdown.tuning.diagnosis.Cause`)."""
     words: str
+    """Description with its size."""
     model: str = ""
     """What models it in a filter: the name of an error state, or :data:`REJECTION`; empty if nothing does."""
     analysed: bool = True
     """Whether a covariance analysis includes it."""
 
 
-def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -> tuple[str, ...]:
-    """Return, as texts with their size, the errors that an origin specifies and a filter does not model; empty if nothing is specified.
+def unmodelled(origin: Origin | None, filter_setup: FilterSetup | None) -> list[SpecifiedError]:
+    """Return the errors that an origin specifies and a filter does not model; none if nothing is specified.
 
     If there are any, σ of the filter are too small; if the axes of the gyro differ, those about the quieter axes are too large.
+    """
+    if origin is None or origin.gyro is None or filter_setup is None:
+        return []
+    known = () if filter_setup.states is None else filter_setup.states.names
+    modelled = {*known, *([REJECTION] if filter_setup.rejects else [])}
+    missing = [error for error in specified_errors(origin) if error.model not in modelled]
+    return missing + _unequal_axes(origin.gyro, filter_setup)
+
+
+def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -> tuple[str, ...]:
+    """Return the errors of :func:`unmodelled` as texts with their size.
 
     Examples
     --------
@@ -53,12 +68,7 @@ def unmodelled_errors(origin: Origin | None, filter_setup: FilterSetup | None) -
     >>> setup.unmodelled_errors(origin, setup.FilterSetup(process_noise=noise, bias_sigma=1e-6))
     ("the gyro's scale factor of 100 ppm",)
     """
-    if origin is None or origin.gyro is None or filter_setup is None:
-        return ()
-    known = () if filter_setup.states is None else filter_setup.states.names
-    modelled = {*known, *([REJECTION] if filter_setup.rejects else [])}
-    missing = [error.words for error in specified_errors(origin) if error.model not in modelled]
-    return (*missing, *_unequal_axes(origin.gyro, filter_setup))
+    return tuple(error.words for error in unmodelled(origin, filter_setup))
 
 
 def unmodelled_words(origin: Origin | None, filter_setup: FilterSetup) -> list[str]:
@@ -88,7 +98,8 @@ def specified_errors(origin: Origin) -> list[SpecifiedError]:
         return []
     sensors, gravity_f = specified(origin)
     saturation = "" if origin.scenario is None else origin.scenario.saturation
-    terms = [*_of_gyro(origin.gyro, gravity_f), (bool(saturation), SpecifiedError(saturation, analysed=False))]
+    clipped = SpecifiedError("gyro", "saturation", saturation, analysed=False)
+    terms = [*_of_gyro(origin.gyro, gravity_f), (bool(saturation), clipped)]
     for sensor in sensors:
         terms += _of_sensor(sensor)
     return [error for size, error in terms if np.any(size)]
@@ -100,24 +111,28 @@ def _of_gyro(spec: GyroSpec, gravity_f: Sequence[float]) -> list[tuple[Any, Spec
         float(np.max(np.abs(getattr(spec, name))))
         for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability", "rate_ramp")
     )
-    drift = f"flicker of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias"
-    terms: list[tuple[Any, str, str, bool]] = [
-        (scale, f"scale factor of {scale / 1e-6:.3g} ppm", "gyro.scale", True),
-        (asymmetry, f"asymmetry of {asymmetry / 1e-6:.3g} ppm", "", True),
-        (misalignment, f"misalignment of {misalignment / 1e-3:.3g} mrad", "gyro.misalignment", True),
-        (flicker, drift, "gyro.drift", True),
-        (np.any(gravity_f) * spec.g_sensitivity, "sensitivity to acceleration", "gyro.force", True),
-        (spec.temperature is not None, "bias over temperature", "gyro.temperature", False),
-        (np.max(spec.quantization) + np.max(spec.rate_resolution), "quantisation", "", False),
-        (ramp, f"rate ramp of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²", "", True),
-        (spec.timestamp_error + spec.sampling_jitter, "irregular sampling or time stamps", "", False),
-        (spec.drop_probability, f"lost samples, {100.0 * spec.drop_probability:.3g} % of all", "", False),
+    drift = f" of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias"
+    terms: list[tuple[Any, str, str, str, bool]] = [
+        (scale, "scale factor", f" of {scale / 1e-6:.3g} ppm", "gyro.scale", True),
+        (asymmetry, "asymmetry", f" of {asymmetry / 1e-6:.3g} ppm", "", True),
+        (misalignment, "misalignment", f" of {misalignment / 1e-3:.3g} mrad", "gyro.misalignment", True),
+        (flicker, "flicker", drift, "gyro.drift", True),
+        (np.any(gravity_f) * spec.g_sensitivity, "sensitivity to acceleration", "", "gyro.force", True),
+        (spec.temperature is not None, "bias over temperature", "", "gyro.temperature", False),
+        (np.max(spec.quantization) + np.max(spec.rate_resolution), "quantisation", "", "", False),
+        (ramp, "rate ramp", f" of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²", "", True),
+        (spec.timestamp_error + spec.sampling_jitter, "irregular sampling or time stamps", "", "", False),
+        (spec.drop_probability, "lost samples", f", {100.0 * spec.drop_probability:.3g} % of all", "", False),
     ]
-    lag = SpecifiedError(f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz")
+    late = f"the gyro's time stamps, late by {spec.timestamp_offset:.3g} s"
+    lag = f"the lag of the gyro's bandwidth of {spec.bandwidth:.3g} Hz"
     return [
-        *((size, SpecifiedError(f"the gyro's {words}", model, analysed)) for size, words, model, analysed in terms),
-        (np.isfinite(spec.bandwidth), lag),
-        (spec.timestamp_offset, SpecifiedError(f"{LATE} by {spec.timestamp_offset:.3g} s", analysed=False)),
+        *(
+            (size, SpecifiedError("gyro", name, f"the gyro's {name}{details}", model, analysed))
+            for size, name, details, model, analysed in terms
+        ),
+        (np.isfinite(spec.bandwidth), SpecifiedError("gyro", "bandwidth", lag)),
+        (spec.timestamp_offset, SpecifiedError("gyro", "time offset", late, analysed=False)),
     ]
 
 
@@ -126,19 +141,24 @@ def _of_sensor(sensor: Any) -> list[tuple[Any, SpecifiedError]]:
     name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
     accelerated = getattr(sensor, "acceleration_f", None) is not None
     terms = (
-        (getattr(sensor, "hard_iron", 0.0), f"the hard iron of the {name}", f"{name}.bias"),
-        (getattr(sensor, "soft_iron", 0.0), f"the soft iron of the {name}", ""),
-        (getattr(sensor, "bias", 0.0), f"the bias of the {name}", f"{name}.bias"),
-        (getattr(sensor, "lever_arm_b", 0.0), f"the accelerations of the {name} at its lever arm", f"{name}.lever"),
-        (accelerated, f"the acceleration of the point where the {name} is mounted", f"{name}.velocity"),
-        (faults.correlated_sigma, f"the correlated noise of the {name}", f"{name}.correlated"),
-        (faults.outlier_probability, f"the outliers of the {name} (a gate rejects them)", REJECTION),
+        (getattr(sensor, "hard_iron", 0.0), "hard iron", f"the hard iron of the {name}", f"{name}.bias"),
+        (getattr(sensor, "soft_iron", 0.0), "soft iron", f"the soft iron of the {name}", ""),
+        (getattr(sensor, "bias", 0.0), "body-fixed bias", f"the bias of the {name}", f"{name}.bias"),
+        (
+            getattr(sensor, "lever_arm_b", 0.0),
+            "lever arm",
+            f"the accelerations of the {name} at its lever arm",
+            f"{name}.lever",
+        ),
+        (accelerated, "acceleration", f"the acceleration of the point where the {name} is mounted", f"{name}.velocity"),
+        (faults.correlated_sigma, "correlated noise", f"the correlated noise of the {name}", f"{name}.correlated"),
+        (faults.outlier_probability, "outliers", f"the outliers of the {name} (a gate rejects them)", REJECTION),
     )
-    return [(size, SpecifiedError(words, model)) for size, words, model in terms]
+    return [(size, SpecifiedError(name, error, words, model)) for size, error, words, model in terms]
 
 
-def _unequal_axes(spec: GyroSpec, filter_setup: FilterSetup) -> list[str]:
-    """Return a text, or none, on how pessimistic a filter with the noise of a gyro's noisiest axis is about the others."""
+def _unequal_axes(spec: GyroSpec, filter_setup: FilterSetup) -> list[SpecifiedError]:
+    """Return an error, or none: how pessimistic a filter with the noise of a gyro's noisiest axis is about the others."""
     assumed = vars(filter_setup.process_noise).items()
     if filter_setup.estimator != MEKF or any(value < 0.99 * np.max(getattr(spec, name)) for name, value in assumed):
         return []  # a filter of one's own, or with the noise of a quieter axis
@@ -148,4 +168,4 @@ def _unequal_axes(spec: GyroSpec, filter_setup: FilterSetup) -> list[str]:
         if values.max() > DIFFERENT_AXES * values.min():
             differ.append(f"{words} ×{values.max() / values.min():.3g}" if values.min() > 0.0 else f"{words} ×∞")
     words = f"the difference of the gyro's axes ({', '.join(differ)}; σ about the quieter ones are too large, by at most these factors)"
-    return [words] if differ else []
+    return [SpecifiedError("gyro", "difference of axes", words)] if differ else []

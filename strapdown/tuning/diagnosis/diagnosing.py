@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from strapdown import coning, consistency, estimation, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
-from strapdown.estimation.setup import LATE, FilterSetup, modelled_record, need_mekf
+from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf, unmodelled
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers, shown
@@ -37,7 +37,7 @@ def diagnose(
     Parameters
     ----------
     record : ImuRecord
-        Record as measured, with all gyro samples; its truth is used if there is one.
+        Record as measured, with all gyro samples; its truth is used if there is one, and errors that its origin specifies are known.
     setup : FilterSetup
         The filter's model. Gates and robust updates are disabled here, because they hide faults.
     initial : State
@@ -75,7 +75,8 @@ def diagnose(
     considered = [*_causes(model, base, estimate), _commutation(record, setup, estimate, kept, better)]
     if max(float(np.mean(i.nis) / i.innovation.shape[1]) for i in measured) > GROSS:
         considered += conventions(model, base)
-    considered = [replace(cause, known=_is_known(cause, judgement.unmodelled)) for cause in considered]
+    known = {(error.of, error.name) for error in unmodelled(record.origin, setup)}
+    considered = [replace(cause, known=(cause.of, cause.name) in known) for cause in considered]
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
     evidence = [*judgement.findings, *(cause.finding for cause in considered)]
     together = consistency.concluded(
@@ -92,13 +93,6 @@ def diagnose(
         considered=tuple(considered),
         judgement=together,
     )
-
-
-def _is_known(cause: Cause, unmodelled: Sequence[str]) -> bool:
-    """Return whether a cause is among the specified errors that a filter does not model, by their words."""
-    of_gyro = LATE if cause.name == "time offset" else f"the gyro's {cause.name}"
-    words = of_gyro if cause.of == "gyro" else f"the {cause.name.removeprefix('body-fixed ')} of the {cause.of}"
-    return any(error.startswith(words) for error in unmodelled)
 
 
 def _causes(model: Model, base: Run, estimate: Estimate) -> Iterator[Cause]:
