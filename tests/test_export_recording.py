@@ -215,6 +215,19 @@ def test_hostile_samples_set_a_flag_and_leave_the_filter_as_it_was(compiled):
     need_close(fed(f, case(name)[1]), expected(name), angle=1e-12, bias=1e-13, variance=1e-11)  # starts again as new
 
 
+def test_a_start_does_not_depend_on_what_the_memory_held(compiled):
+    """As on a stack, where nothing is zero."""
+    name, f = compiled
+    rows = case(name)[1][:330]
+    clean = fed(f, rows)
+    for member, kind in f.state._fields_:
+        if getattr(kind, "_type_", None) is ctypes.c_int:
+            setattr(f.state, member, kind(*[1] * kind._length_))
+        elif hasattr(kind, "_length_"):
+            setattr(f.state, member, kind(*[rows[0][0]] * kind._length_))
+    np.testing.assert_array_equal(fed(f, rows), clean)
+
+
 SANITIZED = """
 #include <math.h>
 #include <stdlib.h>

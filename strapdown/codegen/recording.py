@@ -177,7 +177,7 @@ def init(f: Any) -> Any:
         f.resting[1] = 0
         f.bias_variance[0], f.plausible_variance[0] = r.parameters.bias_sigma**2, starting.FIRST_BIAS_SIGMA**2
         for i in range(3):
-            f.rest_bias[0, i] = 0.0
+            f.rest_bias[0, i] = f.field_before[0, i] = 0.0
     return body.OK
 
 
