@@ -306,15 +306,17 @@ def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
         tenths=np.zeros((rest_length(interval)[0], 4)),
         halves=np.zeros((4, 3)),
         halves_number=np.zeros(4, np.int64),
-        resting=np.zeros(3, np.int64),
+        resting=np.zeros(2, np.int64),
         rest_rate=np.zeros((1, 3)),
         rest_variance=np.array([np.inf]),
         rest_gained=np.array([np.inf]),
         rest_bias=np.zeros((1, 3)),
         bias_variance=np.array([parameters.bias_sigma**2]),
         plausible_variance=np.array([FIRST_BIAS_SIGMA**2]),
-        rest_clock=np.zeros(3),
+        rest_clock=np.zeros(2),
         field_before=np.zeros((1, 3)),
+        field_clock=np.zeros(1),
+        turned_slowly=np.zeros(1, np.int64),
     )
 
 

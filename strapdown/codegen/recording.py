@@ -28,7 +28,7 @@ MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
 LOCAL = ("found_direction", "found_sigma", "found_usual", "found_variance")
 """Arrays of :data:`strapdown.kernels.live_imu.PASSING` that a branch writes: those are local arrays of the target."""
-TIMES = ("start", "ring_time", "rest_clock")
+TIMES = ("start", "ring_time", "rest_clock", "field_clock")
 
 
 @functools.cache

@@ -54,7 +54,7 @@ class Memory(NamedTuple):
     halves_number: np.ndarray
     """Number of samples in the halves (4,)."""
     resting: np.ndarray
-    """Number of samples in the span; 1 if it shows more of the bias, 2 if the next step begins with it; 1 after a slow turn (3,)."""
+    """Number of samples in the span; 1 if it shows more of the bias, 2 if the next step begins with it (2,)."""
     rest_rate: np.ndarray
     """Mean rate of the last span (1, 3), rad/s."""
     rest_variance: np.ndarray
@@ -68,9 +68,13 @@ class Memory(NamedTuple):
     plausible_variance: np.ndarray
     """That of the bias by all rests, at first that of any unit: a mean rate that departs by more is a turn (1,)."""
     rest_clock: np.ndarray
-    """Time of the first sample of the span, of the last rest, and of that of ``field_before``, s (3,)."""
+    """Time of the first sample of the span, and of the last rest, s (2,)."""
     field_before: np.ndarray
     """Direction of the field in an earlier span at rest, zero if the unit has moved since, or if there is no field (1, 3)."""
+    field_clock: np.ndarray
+    """Time of the last sample of the span of ``field_before``, s (1,)."""
+    turned_slowly: np.ndarray
+    """1 if the field had turned slowly at that time (1,)."""
 
 
 class Means(NamedTuple):
@@ -195,7 +199,7 @@ def turns_slowly(constants, rate, change, time, memory):
     The field is compared with that of a span up to two times ``field_time`` before; its turn must be that of the rate, or of the change of
     the rate since the rests before. Once it has turned, its next span must not.
     """
-    before, since = vector_at(memory.field_before, 0), time - memory.rest_clock[2]
+    before, since = vector_at(memory.field_before, 0), time - memory.field_clock[0]
     field = combine(1.0, vector_at(memory.halves, 2), 1.0, vector_at(memory.halves, 3))
     size = math.sqrt(dot(field, field))
     if size > 0.0:
@@ -203,11 +207,11 @@ def turns_slowly(constants, rate, change, time, memory):
     compared = dot(before, before) > 0.0 and size > 0.0
     turned = turned_by(constants, rate, since, before, field) or turned_by(constants, change, since, before, field)
     due = since >= constants.field_time
-    turns = compared and (turned or (memory.resting[2] == 1 and not due))
+    turns = compared and (turned or (memory.turned_slowly[0] == 1 and not due))
     if due or not compared:
         store_row(memory.field_before, 0, field)
-        memory.rest_clock[2] = time
-        memory.resting[2] = 1 if turns else 0
+        memory.field_clock[0] = time
+        memory.turned_slowly[0] = 1 if turns else 0
     return turns
 
 
