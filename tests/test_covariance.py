@@ -613,6 +613,9 @@ def test_what_is_left_out_or_beyond_linear_is_reported():
     early = covariance.analyse(early, setup.FilterSetup.for_scenario(early, states=False), epochs=2)
     assert early.left_out == ("the gyro's quantisation", words := "the gyro's time stamps, late by -0.01 s")
     assert words in early.unmodelled
+    notes = " ".join(early.listing().notes)
+    assert f"Neither the filter nor this analysis includes the gyro's quantisation, {words}." in notes
+    assert [notes.count(error) for error in early.unmodelled] == [1] * len(early.unmodelled)
     steady = white("two-stars", 4.0)
     lossy = dataclasses.replace(steady, gyro=dataclasses.replace(steady.gyro, drop_probability=0.05))
     for scene, words in ((steady, "The"), (lossy, "But for what is left out, the")):
@@ -625,6 +628,21 @@ def test_what_is_left_out_or_beyond_linear_is_reported():
     )
     assert wide.beyond_linear == ("the attitude error itself, 28.6° at 0 s",)
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
+
+
+def test_saturation_by_a_bias_is_that_of_a_lower_limit():
+    """A rate r with a bias b is clipped by r + b − L at the limit L, as without the bias at L − b."""
+    spin = motion.ConstantRate(rate=(0.0, 0.0, 0.5))
+    scene = dataclasses.replace(white("two-stars", 10.0), motion=spin)
+    rows, belief = [], FilterSetup.for_scenario(scene)
+    for bias, limit in ((0.02, 0.51), (0.0, 0.49)):
+        errors = {"range": limit, "turn_on_bias": (0.0, 0.0, bias)}
+        clipped = dataclasses.replace(scene, gyro=dataclasses.replace(scene.gyro, **errors))
+        analysis = covariance.analyse(clipped, belief, epochs=2)
+        assert analysis.left_out == ()
+        rows.append(analysis.fixed_errors[:, analysis.fixed.index("gyro range")])
+    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-9, atol=1e-15)
+    assert np.abs(rows[0]).max() > 1e-3
 
 
 def test_a_lever_arm_is_analysed_whatever_the_errors_of_the_time_stamps():

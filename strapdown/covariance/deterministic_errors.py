@@ -76,6 +76,7 @@ def _fixed_rates(scenario: Scenario) -> dict[str, Array]:
     spec, edges, motion = scenario.gyro, scenario.edges, scenario.motion
     true = motion.increments(edges)
     dt = np.diff(edges)[:, None]
+    clipped = {name: getattr(spec, name) for name in gyro.BEFORE_RANGE}
     rates: dict[str, Array] = {}
     for part, fields in _FIXED_PARTS.items():
         kept = {name: getattr(spec, name) for name in fields}
@@ -84,9 +85,12 @@ def _fixed_rates(scenario: Scenario) -> dict[str, Array]:
         force = None
         if part == "g-sensitivity":
             force = vectors.specific_force(motion, 0.5 * (edges[1:] + edges[:-1]), gravity_f=scenario.gravity_f)
-        random = generator(scenario.seed, 0, "gyro")
-        output = gyro.simulate(GyroSpec(**kept), true, edges, random, specific_force=force)
-        error = (output.increments - true) / dt
+        before = clipped if part == "range" else {}
+        outputs = [
+            gyro.simulate(GyroSpec(**known), true, edges, generator(scenario.seed, 0, "gyro"), specific_force=force)
+            for known in (before | kept, before)
+        ]
+        error = (outputs[0].increments - outputs[1].increments) / dt
         if np.abs(error).max() > 0.0:
             rates[f"gyro {part}"] = error
     return rates

@@ -89,8 +89,7 @@ class Analysis(Listed):
             "the filter models.",
             f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
             self.words,
-            *([f"The filter does not model {', '.join(self.unmodelled)}."] if self.unmodelled else []),
-            *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
+            *self._omissions,
             *(f"Beyond linear: {effect}; use a Monte Carlo (`strapdown montecarlo`)." for effect in self.beyond_linear),
         ]
         columns = (
@@ -103,6 +102,17 @@ class Analysis(Listed):
         )
         title = f"Error budget per axis at {self.time[-1]:.6g} s, RMS"
         return Table(title, columns, rows, notes, left=2, name="budget")
+
+    @property
+    def _omissions(self) -> list[str]:
+        """What the filter does not model, what the analysis leaves out, and what is both, a sentence each."""
+        both = [error for error in self.unmodelled if error in self.left_out]
+        sentences = {
+            "The filter does not model": [error for error in self.unmodelled if error not in both],
+            "Neither the filter nor this analysis includes": both,
+            "Left out of the analysis:": [error for error in self.left_out if error not in both],
+        }
+        return [f"{words} {', '.join(errors)}." for words, errors in sentences.items() if errors]
 
     @property
     def words(self) -> str:

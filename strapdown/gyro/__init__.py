@@ -19,6 +19,7 @@ from strapdown.gyro.model import GyroSpec as GyroSpec
 from strapdown.gyro.model import from_table as from_table
 from strapdown.gyro.model import read_spec as read_spec
 from strapdown.gyro.model import to_table as to_table
+from strapdown.gyro.simulation import BEFORE_RANGE as BEFORE_RANGE
 from strapdown.gyro.simulation import bridge_dropped as bridge_dropped
 from strapdown.gyro.simulation import sampling as sampling
 from strapdown.gyro.simulation import simulate as simulate

@@ -46,6 +46,8 @@ class GyroOutput:
         return np.asarray(self.increments / np.diff(self.edges)[:, None])
 
 
+BEFORE_RANGE = ("turn_on_bias", "scale_factor", "asymmetry", "misalignment", "bandwidth", "damping")
+"""Errors that are the same in every run and act before the range limits the rate."""
 _INITIAL, _LOW_PASS = 4, 5  # stream numbers above those of gyro_errors
 _STREAMS = 8  # stream numbers reserved for an axis
 _UNEVEN = 0.1  # maximum relative deviation of an interval from the mean interval with flicker or low-pass filter

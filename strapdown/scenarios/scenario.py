@@ -9,7 +9,7 @@ import numpy as np
 
 from strapdown import vectors
 from strapdown.checks import Array, InputError, array, count, finite, instance, positive
-from strapdown.gyro import GyroSpec, simulate
+from strapdown.gyro import BEFORE_RANGE, GyroSpec, simulate
 from strapdown.motion import Motion
 from strapdown.results import ByValue
 from strapdown.units import DEGREE
@@ -148,8 +148,7 @@ class Scenario(ByValue):
         limit = self.gyro.range
         if np.isinf(limit):
             return ""
-        names = ("turn_on_bias", "scale_factor", "asymmetry", "misalignment", "bandwidth", "damping")
-        quiet = GyroSpec(**{name: getattr(self.gyro, name) for name in names})
+        quiet = GyroSpec(**{name: getattr(self.gyro, name) for name in BEFORE_RANGE})
         rates = simulate(quiet, self.motion.increments(self.edges), self.edges, np.random.default_rng(0)).rates
         beyond = np.any(np.abs(rates) > limit, axis=1)
         words = f"the gyro's saturation at {limit / DEGREE:.4g} °/s in {np.sum(beyond)} of {len(beyond)} samples"

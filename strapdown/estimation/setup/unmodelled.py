@@ -98,8 +98,7 @@ def specified_errors(origin: Origin) -> list[SpecifiedError]:
         return []
     sensors, gravity_f = specified(origin)
     saturation = "" if origin.scenario is None else origin.scenario.saturation
-    clipped = SpecifiedError("gyro", "saturation", saturation, analysed=False)
-    terms = [*_of_gyro(origin.gyro, gravity_f), (bool(saturation), clipped)]
+    terms = [*_of_gyro(origin.gyro, gravity_f), (bool(saturation), SpecifiedError("gyro", "saturation", saturation))]
     for sensor in sensors:
         terms += _of_sensor(sensor)
     return [error for size, error in terms if np.any(size)]
