@@ -270,18 +270,7 @@ def fit_noise(
     if not random_terms:
         raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
     segments = _segments(record, dt, random_terms, highest_frequency)
-    fits, misfits = [], []
-    for axis in range(record.shape[1]):
-        coefficients = [cosine_transform(record[segment.place, axis], scale) for segment in segments]
-        each, whole = binned(coefficients, segments, dt)
-        largest = scale * float(max(np.nanmax(record[:, axis]), -np.nanmin(record[:, axis])))
-        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
-            raise InputError(
-                f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
-            )
-        fits.append(_fit_axis(whole, "rate_ramp" in in_order))
-        best = fits[-1].best
-        misfits.append(worst_misfit(coefficients, each, segments, best.theta, best.slope, random_terms, dt))
+    fits, misfits = _fit_axes(record, dt, scale, segments, random_terms, with_ramp="rate_ramp" in in_order)
     estimate, lower, upper = _of_axes(fits, in_order, confidence_level)
     return NoiseFit(
         terms=in_order,
@@ -296,6 +285,31 @@ def fit_noise(
         sample_interval=dt,
         sensor=sensor,
     )
+
+
+def _fit_axes(
+    record: Array,
+    dt: float,
+    scale: float,
+    segments: Sequence[Segment],
+    terms: tuple[str, ...],
+    *,
+    with_ramp: bool,
+) -> tuple[list[AxisFit], list[tuple[float, str]]]:
+    """Return the fit of each axis of a record, and its worst misfit: probability and description."""
+    fits, misfits = [], []
+    for axis in range(record.shape[1]):
+        coefficients = [cosine_transform(record[segment.place, axis], scale) for segment in segments]
+        each, whole = binned(coefficients, segments, dt)
+        largest = scale * float(max(np.nanmax(record[:, axis]), -np.nanmin(record[:, axis])))
+        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
+            raise InputError(
+                f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
+            )
+        fits.append(_fit_axis(whole, with_ramp))
+        best = fits[-1].best
+        misfits.append(worst_misfit(coefficients, each, segments, best.theta, best.slope, terms, dt))
+    return fits, misfits
 
 
 def _segments(
