@@ -128,11 +128,6 @@ def in_truth_frames(attitude: Array, alignment: Alignment) -> Array:
     )
 
 
-def turns(first: Array, other: Array) -> Array:
-    """Return the rotation vectors (m, 3), rad, body axes, from attitudes (m, 4) to others."""
-    return quaternion.rotation_between(first, other)
-
-
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
     """Return attitudes (n, 4) at ``time``, interpolated; at the truth's own times they are copied exactly, next to gaps too."""
     result = between_stamps(time, stamps, attitude, bridged)
@@ -181,7 +176,7 @@ def at_common_times(own: Series, theirs: Series, offset: float) -> tuple[Series,
 
 def rates(series: Series) -> tuple[Array, Array]:
     """Return the midpoints of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
-    turn = turns(series.attitude[:-1], series.attitude[1:])
+    turn = quaternion.rotation_between(series.attitude[:-1], series.attitude[1:])
     return 0.5 * (series.time[1:] + series.time[:-1]), turn / np.diff(series.time)[:, None]
 
 
@@ -257,7 +252,7 @@ def _descended(
         matched, truth = at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
         weight = _weights(matched)
-        left = r = weight * turns(aligned, truth.attitude)
+        left = r = weight * quaternion.rotation_between(aligned, truth.attitude)
         if not free.any():
             break
         J = weight[:, :, None] * jacobian(matched.time, aligned, truth)[:, :, free]

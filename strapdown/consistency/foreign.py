@@ -27,14 +27,13 @@ from strapdown.consistency.alignment import (
     in_truth_frames,
     jacobian,
     series_of,
-    turns,
 )
 from strapdown.consistency.bounds import mean_p_value
 from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge, mark
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.estimation.setup import from_toml, unmodelled
-from strapdown.records import Estimate, Innovations, Origin, Truth
+from strapdown.records import Estimate, Innovations, Origin
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -181,74 +180,85 @@ def check_attitudes(
     """
     how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     if truth is None:
-        if not own.innovations:
-            raise InputError(
-                f"{own.source} has no innovations, so it cannot be judged without a truth; give {Hint('truth')}, attitudes over the same "
-                "time"
-            )
-        estimate = without_covariance(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        estimate = replace(estimate, motion=own.motion)
-        return Checked(judgement=judge(estimate, **how), estimate=estimate)
+        return _without_truth(own, how)
     declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
     one_of("error_frame", declared, ("find", *ERROR_FRAMES))
-    # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
-    origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
-    with_bias = own.bias is not None and truth.bias is not None
-    P = own.covariance if with_bias or own.covariance is None else own.covariance[:, :3, :3]
-    whole = series_of("", own.seconds(origin), own.attitude, P, own.bias if with_bias else None)
-    theirs = series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement)
+    whole, theirs = _series_of_both(own, truth)
     remarks: list[str] = []
     whole, alignment = align_series(whole, theirs, _wanted(align), remarks)
     common, true = at_common_times(whole, theirs, alignment.offset)
     remarks += alignment.words
     aligned = in_truth_frames(common.attitude, alignment)
     frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
-    if common.covariance is None:
+    if whole.covariance is None:
         estimate = without_covariance(common.time, aligned, own.innovations)
     else:
-        readings = {name: read_as(name, common.covariance, common.attitude) for name in ERROR_FRAMES}
-        readings = {name: _in_truth_axes(P, common, true, alignment) for name, P in readings.items()}
-        error = turns(aligned, true.attitude)
+        derivatives = jacobian(common.time, aligned, true)
+        readings = _readings(common, alignment, derivatives)
+        error = quaternion.rotation_between(aligned, true.attitude)
         probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
         frame, words = _chosen_frame(declared, probabilities)
         remarks += words
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         bias = None if common.bias is None else quaternion.rotate(body, common.bias)
         estimate = Estimate.from_arrays(common.time, aligned, readings[frame], bias=bias, innovations=own.innovations)
-        assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
-        derivatives = jacobian(common.time, aligned, true)
         others = list(_other_frames(error, readings, frame, probabilities))
         if common.bias is not None and not common.bias.any():
             others.append(_zero_bias(true.bias, readings[frame]))
         explained = explanations(error, readings[frame], derivatives, others, confidence_level=confidence_level)
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
-    estimate = replace(estimate, truth=true, motion=own.motion, remarks=tuple(f"Note: {words}." for words in remarks))
     estimate = replace(
         estimate,
+        truth=true,
+        motion=own.motion,
+        remarks=tuple(f"Note: {words}." for words in remarks),
         setup=from_toml(own.filter, f"{own.source}: filter") if own.filter else None,
         origin=replace(own.origin or Origin(), source=own.source, epoch_ns=0),
         details={"truth": truth.source},
     )
-    judgement = judge(estimate, **how)
-    late = any(
-        (error.of, error.name) == ("gyro", "time offset") for error in unmodelled(estimate.origin, estimate.setup)
-    )
-    explained = tuple(
-        replace(e, known=late if e.name == CLOCK else e.name == SCALE and bool(own.motion) and float(e.value) < 1.0)
-        for e in explained
-    )
     return Checked(
-        judgement=judgement,
+        judgement=judge(estimate, **how),
         estimate=estimate,
         alignment=alignment,
         error_frame=frame,
         frame_probability=probabilities if declared == "find" else {},
-        explanations=explained,
+        explanations=tuple(replace(e, known=_is_known(e, estimate)) for e in explained),
         remarks=tuple(remarks),
         accuracy=accuracy_of(whole, theirs),
     )
+
+
+def _without_truth(own: Attitudes, how: Mapping[str, Any]) -> Checked:
+    """Return the verdict on the innovations of an estimate."""
+    if not own.innovations:
+        raise InputError(
+            f"{own.source} has no innovations, so it cannot be judged without a truth; give {Hint('truth')}, attitudes over the same time"
+        )
+    estimate = without_covariance(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+    estimate = replace(estimate, motion=own.motion)
+    return Checked(judgement=judge(estimate, **how), estimate=estimate)
+
+
+def _series_of_both(own: Attitudes, truth: Attitudes) -> tuple[Series, Series]:
+    """Return the histories of an estimate and a truth, with biases if both have them."""
+    # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
+    origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
+    with_bias = own.bias is not None and truth.bias is not None
+    P = own.covariance if with_bias or own.covariance is None else own.covariance[:, :3, :3]
+    return (
+        series_of("", own.seconds(origin), own.attitude, P, own.bias if with_bias else None),
+        series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement),
+    )
+
+
+def _is_known(explanation: Explanation, estimate: Estimate) -> bool:
+    """Return whether the verdict itself names a difference: late stamps that are specified, or σ that are upper bounds."""
+    if explanation.name == CLOCK:
+        late = ("gyro", "time offset")
+        return any((error.of, error.name) == late for error in unmodelled(estimate.origin, estimate.setup))
+    return explanation.name == SCALE and bool(estimate.motion) and float(explanation.value) < 1.0
 
 
 def _chosen_frame(wanted: str, probabilities: Mapping[str, float]) -> tuple[str, list[str]]:
@@ -317,16 +327,18 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
     return {name: value / sum(likelihood.values()) for name, value in likelihood.items()}
 
 
-def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) -> Array:
-    """Return covariances in the truth's body axes, with the uncertainty of the alignment added."""
+def _readings(own: Series, alignment: Alignment, J: Array) -> dict[str, Array]:
+    """Return the covariances by definition, in the truth's body axes, with the uncertainty of the alignment added.
+
+    ``J`` (m, 3, 7): derivatives of the errors with respect to the alignment (:func:`jacobian`).
+    """
+    assert own.covariance is not None
     turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
-    size = P.shape[1]
-    T = np.kron(np.eye(size // 3), turn)
-    result = T @ P @ T.T
-    if alignment.estimated:
-        J = jacobian(own.time, in_truth_frames(own.attitude, alignment), truth)
-        result[:, :3, :3] += J @ alignment.covariance @ np.swapaxes(J, 1, 2)
-    return np.asarray(result)
+    T = np.kron(np.eye(own.covariance.shape[1] // 3), turn)
+    readings = {name: T @ read_as(name, own.covariance, own.attitude) @ T.T for name in ERROR_FRAMES}
+    for P in readings.values():
+        P[:, :3, :3] += J @ alignment.covariance @ np.swapaxes(J, 1, 2)
+    return readings
 
 
 # -------------------------------------------------------------------------------------------------------- explanations

@@ -15,9 +15,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from strapdown import consistency
+from strapdown import consistency, quaternion
 from strapdown.checks import Array, InputError, are_finite
-from strapdown.consistency.alignment import turns
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import PARTS, STEP, Case, Derivatives, Objective
@@ -118,7 +117,7 @@ def _reference(base: Likelihood, number: int) -> Reference:
     if m >= 100:
         estimated, _, P = base.estimates(number, base.start[None], epochs)
         sigma = np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
-        white = turns(estimated[:, 0], attitude[edges[epochs]]) / sigma
+        white = quaternion.rotation_between(estimated[:, 0], attitude[edges[epochs]]) / sigma
         while lag < m // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
             lag += 1
     epochs = epochs[::lag]
