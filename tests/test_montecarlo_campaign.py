@@ -188,6 +188,10 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
         ({"plan": replace(PLAN, setup=replace(SETUP, attitude_sigma=0.1))}, "filter.attitude_sigma_deg is"),
         ({"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8))}, "scenario.duration_s is 2.4 there and 4.8"),
         (
+            {"plan": replace(PLAN, scenario=replace(SCENARIO, name="other"), setup=replace(SETUP, attitude_sigma=0.1))},
+            "scenario.name is spin there and other here",  # not the filter, which follows from it
+        ),
+        (
             {"plan": replace(PLAN, scenario=replace(SCENARIO, sensors=SCENARIO.sensors[:1]))},
             r"scenario.sensors.1.\S+ is \S+ there and not given here",
         ),
@@ -402,6 +406,8 @@ def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
 def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     assert command("short.toml", "--runs", 6, "--machine", machine)[0] in (1, 3)
     held = campaign.read("short-montecarlo.h5")
+    status, _, error = command("short-montecarlo.h5", "--replay", 6)
+    assert (status, "has the runs 0 to 5; give one of them" in " ".join(error.split())) == (2, True)
     status, said, _ = command("short-montecarlo.h5", "--replay", 5)
     assert status == 0
     assert "Run 5 of seed 1" in said

@@ -9,8 +9,9 @@ import scipy.stats
 from measured import differing
 
 import strapdown as sd
-from strapdown import gyro, motion, quaternion, scenarios, vectors
+from strapdown import gyro, montecarlo, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
+from strapdown.consistency import Judgement
 from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
 from strapdown.scenarios import Scenario, load_scenario, scenario_from_toml, scenario_to_table, scenario_to_toml
@@ -254,6 +255,19 @@ def test_saturation_is_counted_and_named_everywhere():
     assert noisy.saturation in plan.unmodelled
     analysis = sd.covariance_analysis(noisy, plan.setup, epochs=5)
     assert ("gyro range" in analysis.fixed, analysis.left_out) == (True, ())
+
+
+def test_a_motion_that_changes_after_the_end_only_is_warned_of():
+    slew = load_scenario("slew-vibration")
+    for start, late in ((10.0, False), (39.0, False), (40.0, True), (100.0, True)):
+        base = dataclasses.replace(slew.motion.base, start=start)
+        scene = dataclasses.replace(slew, motion=dataclasses.replace(slew.motion, base=base))
+        plan = sd.workflows.plan(scene)
+        runs = montecarlo.campaign.Campaign(plan=plan, machine="scalar", chunk=1, runs=1, statistics=None)
+        verdict = Judgement(verdict="consistent", reason="", findings=(), limits=(), confidence_level=0.99)
+        for said in (sd.simulate(scene).listing().notes, montecarlo.campaign.words(runs, verdict)):
+            assert (f"the motion changes at {start:g} s, after the end at 40 s" in " ".join(said)) == late
+    assert load_scenario("coning").late_motion == ""
 
 
 def simulate_exactly(scenario: Scenario) -> int:

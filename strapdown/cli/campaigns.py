@@ -76,6 +76,8 @@ def montecarlo(
     ui.check_files(target, suffixes=ui.HDF5, reads=False)
     ui.check_files(beside)
     if replay is not None:
+        if held is not None and replay >= held.runs:
+            raise InputError(f"--replay is {replay}, and {source} has the runs 0 to {held.runs - 1}; give one of them")
         _replay(plan, replay, computing.machine, target)
         return None
     new = held is None or target != source or computing.resume or computing.overwrite

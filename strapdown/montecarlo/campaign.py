@@ -134,6 +134,8 @@ def words(campaign: Campaign, judgement: Judgement) -> list[str]:
     """Return extent and verdict of a campaign, and what would make the verdict clearer."""
     scenario, filter_setup = campaign.plan.scenario, campaign.plan.setup
     sentences = [f"{campaign.extent}, computed in {campaign.seconds:.3g} s.", judgement.words]
+    if scenario.late_motion:
+        sentences.append(f"Warning: {scenario.late_motion}.")
     if judgement.verdict == "cannot tell":
         sentences.append(f"More runs ({Hint('runs')}, with {Hint('resume', True)}) are needed for a decision.")
     if judgement.unmodelled and (remedy := setup.remedy(campaign.plan.origin, filter_setup)):
@@ -292,13 +294,13 @@ def _compute(campaign: Campaign, path: Path, workers: Workers, progress: Callabl
 
 
 def _need_same(target: Path, held: Campaign, wanted: Campaign) -> None:
-    """Raise if the campaign of a file is another one, naming the first difference."""
+    """Raise if the campaign of a file is another one, naming the first difference: that of the scenario, on which the filter depends."""
     here, there = (
         dict(_values(campaign.plan.to_table()))
         | {"machine": campaign.machine, "chunk": campaign.chunk, **campaign.identity._asdict()}
         for campaign in (wanted, held)
     )
-    for name in sorted(here.keys() | there.keys()):
+    for name in here | there:
         if here.get(name) != there.get(name):
             of_code = name in ("version", "sources")
             remedy = "continue it with the strapdown that began it" if of_code else "give the value in the file"

@@ -177,10 +177,9 @@ class ImuRecord(ByValue, Listed):
         rows += [(series.sensor, series.kind, len(series.time), len(series.time) / span) for series in self.vectors]
         notes = [f"Truth: {'attitude and gyro bias' if self.truth is not None else 'not known'}."]
         if self.origin is not None and self.origin.scenario is not None:
-            name = self.origin.scenario.name or "a scenario"
-            notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
-            if self.origin.scenario.saturation:
-                notes.append(f"warning: {self.origin.scenario.saturation}")
+            scenario = self.origin.scenario
+            notes.append(f"Simulated: {scenario.name or 'a scenario'}, seed {self.origin.seed}, run {self.origin.run}.")
+            notes += [f"warning: {words}" for words in (scenario.saturation, scenario.late_motion) if words]
         for series in self.vectors:
             sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
             if series.covariance is None and np.any(sigma == 0.0):

@@ -11,6 +11,7 @@ from strapdown import vectors
 from strapdown.checks import Array, InputError, array, count, finite, instance, positive
 from strapdown.gyro import BEFORE_RANGE, GyroSpec, simulate
 from strapdown.motion import Motion
+from strapdown.motion.protocol import break_times
 from strapdown.results import ByValue
 from strapdown.units import DEGREE
 from strapdown.vectors import Sensor
@@ -153,3 +154,14 @@ class Scenario(ByValue):
         beyond = np.any(np.abs(rates) > limit, axis=1)
         words = f"the gyro's saturation at {limit / DEGREE:.4g} °/s in {np.sum(beyond)} of {len(beyond)} samples"
         return words if beyond.any() else ""
+
+    @property
+    def late_motion(self) -> str:
+        """Time at which the motion first changes if that is after the end, in words; empty if it is not."""
+        times = break_times("motion", self.motion)
+        if not len(times) or times[0] < self.duration:
+            return ""
+        return (
+            f"the motion changes at {times[0]:.6g} s, after the end at {self.duration:.6g} s, so the change is not simulated: let it start "
+            "earlier, or make the scenario longer"
+        )
