@@ -13,7 +13,7 @@ import strapdown as sd
 from strapdown.checks import InputError, count
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import GYRO, SCENARIO, STATES, options_given
-from strapdown.files import write_json
+from strapdown.files import HDF5, write_json
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Plan
@@ -73,7 +73,7 @@ def montecarlo(
         raise InputError("--resume and --overwrite exclude each other; give one of them")
     if beside.exists() and not target.exists() and not computing.overwrite and replay is None:
         raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    ui.check_files(target, suffixes=ui.HDF5, reads=False)
+    ui.check_files(target, suffixes=HDF5, reads=False)
     ui.check_files(beside)
     if replay is not None:
         if held is not None and replay >= held.runs:
@@ -105,7 +105,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
     if place is not None and (place.suffix == ".py" or ".py:" in place.name):
         ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
         setup = read_filter(place)
-    if source.suffix.lower() in ui.HDF5:
+    if source.suffix.lower() in HDF5:
         held = campaigns.read(source)
         if isinstance(setup, Own):
             held, model = campaigns.with_filter(held, setup, source), replace(model, filter_file=None)

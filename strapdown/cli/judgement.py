@@ -12,7 +12,7 @@ import strapdown as sd
 from strapdown.checks import InputError
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import options_given
-from strapdown.files import reading
+from strapdown.files import HDF5, reading
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def check(
     for name in options_given(foreign) if foreign.truth is None else ():
         raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.aligned is not None:
-        ui.check_files(foreign.aligned, suffixes=ui.HDF5, name="aligned")
+        ui.check_files(foreign.aligned, suffixes=HDF5, name="aligned")
     if own:
         held: Any = sd.read(result)
         if record is not None and not isinstance(held, sd.records.Estimate):

@@ -9,6 +9,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import SCENARIO
+from strapdown.files import HDF5
 
 
 @ui.command()
@@ -47,7 +48,7 @@ def simulate(
     """Simulate a scenario: a record with its truth."""
     loaded = sd.scenarios.load_scenario(scenario)
     target = out or Path(f"{Path(scenario).stem}.h5")
-    ui.check_files(target, suffixes=ui.HDF5, own="strapdown record")
+    ui.check_files(target, suffixes=HDF5, own="strapdown record")
     with ui.progress_bar("simulating, writing"):
         record = sd.scenarios.simulate(loaded, seed)
         sd.write(record, target)

@@ -10,7 +10,7 @@ from typer import Argument, Option
 import strapdown as sd
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import FILTER, FORMAT, RECORDING_HELP, SCENARIO, STATES, Format, Layout, by_name, numbers
-from strapdown.files import reading, write_json
+from strapdown.files import HDF5, reading, write_json
 from strapdown.units import DEGREE
 
 
@@ -98,7 +98,7 @@ def integrate(
     out: Path = Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
-    ui.check_files(out, suffixes=ui.HDF5, own="strapdown estimate")
+    ui.check_files(out, suffixes=HDF5, own="strapdown estimate")
     rule = sd.coning.named(algorithm)
     with ui.progress_bar("reading, integrating, writing"):
         source: Any = sd.read(recording, **layout.options)

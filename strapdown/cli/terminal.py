@@ -78,7 +78,6 @@ _EXTRA: dict[str, Any] = {
     "json": Option(None, "--json", help="File for all numbers; - for standard output."),
 }
 """Options that :func:`command` adds and serves."""
-HDF5 = (".h5", ".hdf5")
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 EVIDENCE = "Statistics of the filter and their bounds for a consistent filter"
 """Title of the findings of a judgement, whose own title, the verdict, stands below them."""

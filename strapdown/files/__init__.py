@@ -9,6 +9,9 @@
 from __future__ import annotations
 
 from strapdown.files.writing import (
+    BAGS,
+    HDF5,
+    TABLES,
     atomic_write,
     json_text,
     locked,

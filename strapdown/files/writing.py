@@ -121,23 +121,12 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
             node.attrs[name] = value
 
 
-FILES = (
-    ".h5",
-    ".hdf5",
-    ".json",
-    ".toml",
-    ".html",
-    ".csv",
-    ".tsv",
-    ".parquet",
-    ".tum",
-    ".bag",
-    ".mcap",
-    ".db3",
-    ".png",
-    ".pdf",
-    ".svg",
-)
+HDF5 = (".h5", ".hdf5")
+"""Suffixes of files that hold results completely."""
+TABLES = (".csv", ".tsv", ".parquet")
+"""Suffixes of the tables that hold a recording completely."""
+BAGS = (".bag", ".mcap", ".db3")
+FILES = (*HDF5, *TABLES, *BAGS, ".tum", ".json", ".toml", ".html", ".png", ".pdf", ".svg")
 """Suffixes that the name of a new folder must not have: a file was meant."""
 
 

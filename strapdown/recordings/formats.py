@@ -16,14 +16,12 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Hint, InputError, one_of
-from strapdown.files import reading
+from strapdown.files import BAGS, HDF5, TABLES, reading
 from strapdown.recordings import broad, dataframes, delimited, ros, telemetry, trajectories, ulog
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord, outputs
 from strapdown.records.recording import Recording, matched, with_gyro
 
-ALL = (".csv", ".tsv", ".parquet")
-"""Endings of the formats that store everything."""
 HEAD = 4096
 """Number of bytes at the start of a file from which its format is recognised."""
 
@@ -74,7 +72,7 @@ def _text(head: bytes) -> bool:
 FORMATS: tuple[Format, ...] = (
     Format(
         name="ROS bag",
-        endings=(".bag", ".mcap", ".db3"),
+        endings=BAGS,
         recognised=lambda path, head: (path / "metadata.yaml").is_file() or head.startswith(ros.BEGINNINGS),
         read=ros.read_bag,
         options=("topic",),
@@ -122,7 +120,7 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format(
         name="BROAD",
-        endings=(".hdf5", ".h5"),
+        endings=HDF5,
         recognised=_starts(b"\x89HDF\r\n\x1a\n", reading.SEAL),
         read=broad.read_broad,
         write=broad.write_broad,
@@ -223,9 +221,7 @@ def write(
         file_format.write(content, Path(path), **options)
         stored = (*content.parts, *(["clock"] if content.epoch_ns else []))
         if lost := [name for name in file_format.lacks if name in stored]:
-            words = (
-                f"{Path(path).name} ({file_format.name}) cannot store {', '.join(lost)}: omitted; {', '.join(ALL)} can"
-            )
+            words = f"{Path(path).name} ({file_format.name}) cannot store {', '.join(lost)}: omitted; {', '.join(TABLES)} can"
             warnings.warn(words, OmissionWarning, stacklevel=3)
 
 

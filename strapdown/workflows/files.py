@@ -14,16 +14,13 @@ from strapdown import recordings, scenarios
 from strapdown.checks import Hint, InputError, instance
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
-from strapdown.files import reading, write_text
+from strapdown.files import HDF5, reading, write_text
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord
 from strapdown.scenarios import Scenario
 
 if TYPE_CHECKING:
     from strapdown.montecarlo.campaign import Campaign
-
-HDF5 = (".h5", ".hdf5")
-"""Suffixes of files that hold results completely."""
 
 COLUMNS = ("columns", "data_vars", "__arrow_c_stream__")
 """Attributes of an object that holds columns."""
