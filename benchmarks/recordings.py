@@ -128,14 +128,25 @@ class Score:
     """Heading offset that was removed."""
 
 
-def score(recording: Recording, run: Filter, offset: float | None = None) -> Score:
-    """Return the score of a filter on a recording, over the movement where reference and attitude are known.
+def score(recording: Recording, run: Filter) -> Score:
+    """Return the score of a filter on a recording, with its mean heading offset removed."""
+    return score_of(recording, *timed(recording, run))
+
+
+def timed(recording: Recording, run: Filter) -> tuple[Array, Array | None, float]:
+    """Return attitude and covariance of a filter on a recording, and its time per sample, µs."""
+    begin = time.process_time()
+    attitude, covariance = run(recording)
+    return attitude, covariance, 1e6 * (time.process_time() - begin) / len(recording.time)
+
+
+def score_of(
+    recording: Recording, attitude: Array, covariance: Array | None, us: float, offset: float | None = None
+) -> Score:
+    """Return the score of attitudes of a recording, over the movement where reference and attitude are known.
 
     ``offset``: of the heading, rad, to be removed; its own mean by default.
     """
-    begin = time.process_time()
-    attitude, covariance = run(recording)
-    us = 1e6 * (time.process_time() - begin) / len(recording.time)
     known = np.isfinite(attitude).all(axis=1)
     rows = float(np.mean(known))
     assert recording.true_attitude is not None
@@ -215,12 +226,13 @@ def table(result: dict[str, Any]) -> str:
 
 def scores_of(recordings: Sequence[Recording], run: Filter, *, common_offset: bool) -> list[Score]:
     """Return the scores of a filter on the recordings of a set, with a heading offset of each or of all."""
-    own = [score(recording, run) for recording in recordings]
+    runs = [timed(recording, run) for recording in recordings]
+    own = [score_of(recording, *result) for recording, result in zip(recordings, runs, strict=True)]
     if not common_offset:
         return own
     unit = np.exp(1j * np.radians([each.offset_deg for each in own if each.offset_deg is not None]))
     common = math.atan2(np.median(unit.imag), np.median(unit.real))
-    return [score(recording, run, common) for recording in recordings]
+    return [score_of(recording, *result, common) for recording, result in zip(recordings, runs, strict=True)]
 
 
 def main(
