@@ -544,14 +544,13 @@ def test_chunks_that_finish_out_of_order_are_merged_in_order():
     sums = montecarlo.run_plan(PLAN, runs=30, chunk=5, threads=1, machine="scalar")
     last = threading.Event()
 
-    class LastFirst(engine.Work):
-        def __call__(self, first_run, runs):
-            result = super().__call__(first_run, runs)
-            last.set() if first_run == 25 else last.wait(60.0)
-            return result
+    def last_first(first_run, runs):
+        result = engine.compute((PLAN,), "scalar", first_run, runs)
+        last.set() if first_run == 25 else last.wait(60.0)
+        return result
 
-    work, threads = LastFirst(plans=(PLAN,), machine="scalar"), threading.active_count()
-    parts = [part for (part,) in engine.in_threads(6)(work, engine.chunks_of(30, 5))]
+    threads = threading.active_count()
+    parts = [part for (part,) in engine.in_threads(6)(last_first, engine.chunks_of(30, 5))]
     time.sleep(0.1)
     assert threading.active_count() <= threads
     assert not different(sums, functools.reduce(montecarlo.merge, parts))

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.files import locked, reading, set_attributes
 from strapdown.montecarlo import verdicts
-from strapdown.montecarlo.engine import MACHINES, Identity, Work, Workers, choose, chunks_of, identity, in_threads
+from strapdown.montecarlo.engine import MACHINES, Identity, Workers, choose, chunks_of, compute, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import ARRAYS, Statistics, lengths_of, merge
 from strapdown.records import put
@@ -277,7 +278,7 @@ def _compute(campaign: Campaign, path: Path, workers: Workers, progress: Callabl
         progress(campaign.finished_runs)
     written = write()  # fails before anything is computed if the file cannot be written
     due, unwritten = 0.0, False
-    work = Work(plans=(campaign.plan,), machine=campaign.machine)
+    work = partial(compute, (campaign.plan,), campaign.machine)
     try:
         for (part,) in workers(work, chunks_of(campaign.runs, campaign.chunk, campaign.finished_runs)):
             statistics = part if whole is None else merge(whole, part)

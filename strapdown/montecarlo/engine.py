@@ -9,7 +9,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -43,8 +43,7 @@ AHEAD = 4
 """Maximum number of chunks per worker that are submitted and not yet merged; bounds the memory."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choice:
+class Choice(NamedTuple):
     """The machine that computes a plan, and the reason for not using a faster one."""
 
     machine: str
@@ -62,14 +61,14 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     The choice depends only on the plan, because the machines draw different noise.
     """
     one_of("machine", machine, ("auto", *MACHINES))
-    reason = None if machine == scalar.NAME else lanes.supports(plan)
-    if reason is None:
-        return Choice(machine=scalar.NAME if machine == scalar.NAME else lanes.NAME)
-    if machine == lanes.NAME:
+    if machine == scalar.NAME:
+        return Choice(scalar.NAME)
+    reason = lanes.supports(plan)
+    if reason and machine == lanes.NAME:
         raise InputError(
             f"the lanes do not cover this plan: {reason}; use the machine scalar, or a simpler filter or scenario"
         )
-    return Choice(machine=scalar.NAME, reason=reason)
+    return Choice(scalar.NAME if reason else lanes.NAME, reason)
 
 
 class Identity(NamedTuple):
@@ -151,21 +150,15 @@ def chunks_of(runs: int, chunk: int, first: int = 0) -> Iterator[tuple[int, int]
     return ((start, min(chunk, runs - start)) for start in range(first, runs, chunk))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Work:
-    """Function that computes a chunk; picklable, for other processes."""
-
-    plans: tuple[Plan, ...]
-    """Plans that differ only in the filter; the simulated measurements are the same for all."""
-    machine: str
-
-    def __call__(self, first_run: int, runs: int) -> Parts:
-        """Return the statistics of a chunk, one per plan."""
-        if self.machine == scalar.NAME:  # simulates each run once
-            return scalar.run_chunks(self.plans, first_run, runs)
-        return tuple(MACHINES[self.machine].run_chunk(plan, first_run, runs) for plan in self.plans)
+def compute(plans: tuple[Plan, ...], machine: str, first_run: int, runs: int) -> Parts:
+    """Return the statistics of a chunk, one per plan; the plans differ only in the filter."""
+    if machine == scalar.NAME:  # simulates each run once
+        return scalar.run_chunks(plans, first_run, runs)
+    return tuple(MACHINES[machine].run_chunk(plan, first_run, runs) for plan in plans)
 
 
+Work = Callable[[int, int], Parts]
+"""Function that computes a chunk from its first run and number of runs; picklable, for other processes."""
 Workers = Callable[[Work, Iterable[tuple[int, int]]], Iterator[Parts]]
 """Function that computes chunks and yields their statistics in the order of the chunks."""
 
@@ -312,7 +305,7 @@ def _run(
 ) -> Parts:
     size = MACHINES[machine].CHUNK if chunk is None else count("chunk", chunk)
     total: Parts = ()
-    for parts in workers(Work(plans=plans, machine=machine), chunks_of(count("runs", runs), size)):
+    for parts in workers(functools.partial(compute, plans, machine), chunks_of(count("runs", runs), size)):
         total = tuple(map(merge, total, parts)) if total else parts
         if progress is not None:
             progress(parts[0].runs)

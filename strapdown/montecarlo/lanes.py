@@ -77,9 +77,9 @@ _NOT_OF_THE_GYRO = {
 _SENSORS = (vectors.VectorSensor, vectors.HorizonSensor, Magnetometer, Accelerometer, AttitudeSensor)
 
 
-def supports(plan: Plan) -> str | None:
-    """Return why the lanes cannot compute a plan; None if they can."""
-    return next(_reasons(plan), None)
+def supports(plan: Plan) -> str:
+    """Return why the lanes cannot compute a plan; empty if they can."""
+    return next(_reasons(plan), "")
 
 
 def _reasons(plan: Plan) -> Iterator[str]:

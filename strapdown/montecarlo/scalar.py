@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import consistency, estimation
-from strapdown.checks import Array, InputError, are_finite
+from strapdown import estimation
+from strapdown.checks import Array, are_finite
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
@@ -23,6 +23,8 @@ from strapdown.montecarlo.statistics import (
     Replay,
     Statistics,
     bin_of,
+    errors_at,
+    nees_at,
     worst,
     zeros,
 )
@@ -126,28 +128,20 @@ class Sums:
         assert estimate.covariance is not None
         rows = slice(None) if regular else _at_epochs(estimate.time, self.sums.time)
         edges = np.searchsorted(record.time, estimate.time[rows])
-        P = estimate.covariance[rows]
-        known = are_finite(estimate.attitude[rows])
-        error = np.full((len(P), 6), np.nan)
-        error[known] = consistency.errors(
-            estimate.attitude[rows][known],
-            estimate.bias[rows][known],
-            record.truth.attitude[edges[known]],
-            record.truth.bias[edges[known]],
-        )
-        self._add_errors(run, error, P)
+        error = errors_at(estimate, rows, record.truth.taken(edges))
+        self._add_errors(run, error, estimate.covariance[rows])
         self._add_innovations(estimate)
 
     def _add_errors(self, run: int, error: Array, P: Array) -> None:
         with np.errstate(invalid="ignore"):  # not finite after a failure of the filter
             sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         if np.isnan(P[:, 3:, 3:]).all():  # no bias is estimated: the state is the attitude, and the bias adds zero
-            attitude = _nees(error[:, :3], P[:, :3, :3])
+            attitude = nees_at(error[:, :3], P[:, :3, :3])
             nees = np.stack([attitude, attitude, np.zeros(len(P))], axis=1)
             error = np.where(np.arange(6) < 3, error, 0.0)
             P = np.nan_to_num(P)
         else:
-            nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
+            nees = np.stack([nees_at(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
         good = are_finite(nees) & are_finite(error) & np.isfinite(P).all(axis=(1, 2))
         m, sums = np.flatnonzero(good), self.sums
         e, squares = error[m], nees[m]
@@ -196,13 +190,3 @@ def _at_epochs(time: Array, epochs: Array) -> np.ndarray:
     """Return the last step at or before each epoch, or the first; the tolerance is 1e-6 of the mean step."""
     slack = 1e-6 * (time[-1] - time[0]) / max(len(time) - 1, 1)
     return np.asarray(np.maximum(np.searchsorted(time, epochs + slack, side="right") - 1, 0))
-
-
-def _nees(error: Array, P: Array) -> Array:
-    """Return the NEES at each epoch, NaN if P is not positive definite."""
-    try:
-        return consistency.nees(error, P)
-    except InputError:
-        if len(error) == 1:
-            return np.full(1, np.nan)
-        return np.concatenate([_nees(error[k : k + 1], P[k : k + 1]) for k in range(len(error))])

@@ -28,7 +28,7 @@ from strapdown.consistency.judgement import (
     state_name,
 )
 from strapdown.montecarlo.plan import Plan
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.results import ByValue, Listed, Table, figure
 
 Counts = NDArray[np.int64]
@@ -52,7 +52,7 @@ SHIFT = 49
 FIRST_BIN = (1023 + ERROR_EXPONENT) * BINS_PER_OCTAVE
 """That constant: bin 0 begins at 2 to ``ERROR_EXPONENT``."""
 
-SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
+SUBSETS = {name: (column, len(states)) for column, (name, states) in enumerate(consistency.SUBSETS.items())}
 """Column of the NEES and degrees of freedom of each subset of the states."""
 
 
@@ -88,15 +88,30 @@ class Replay:
         assert estimate.covariance is not None
         assert truth is not None
         rows = np.searchsorted(estimate.time, np.asarray(epochs) + 1e-9, side="right") - 1
-        q, P = estimate.attitude[rows], estimate.covariance[rows, :size, :size]
-        good = are_finite(np.c_[q, P.reshape(len(q), -1)])
-        good[good] = np.linalg.eigvalsh(P[good])[:, 0] > 0.0
-        nees, kept = np.full(len(rows), np.inf), rows[good]
-        bias = np.nan_to_num(estimate.bias[kept])
-        error = consistency.errors(q[good], bias, truth.attitude[kept], truth.bias[kept])
-        nees[good] = consistency.nees(error[:, :size], P[good])
+        error = errors_at(estimate, rows, truth.taken(rows))
+        nees = nees_at(error[:, :size], estimate.covariance[rows, :size, :size])
+        nees[np.isnan(nees)] = np.inf
         worst = int(np.argmax(nees))
         return float(nees[worst]), float(estimate.time[rows[worst]])
+
+
+def errors_at(estimate: Estimate, rows: Any, truth: Truth) -> Array:
+    """Return the errors (m, 6) of some rows of an estimate, at which the truth is given; NaN where the filter has failed."""
+    attitude, bias = estimate.attitude[rows], estimate.bias[rows]
+    known = are_finite(attitude)
+    error = np.full((len(attitude), 6), np.nan)
+    error[known] = consistency.errors(attitude[known], bias[known], truth.attitude[known], truth.bias[known])
+    return error
+
+
+def nees_at(error: Array, P: Array) -> Array:
+    """Return the NEES at each epoch (m,), NaN where the filter has failed or P is not positive definite."""
+    try:
+        return consistency.nees(error, P)
+    except InputError:
+        if len(error) == 1:
+            return np.full(1, np.nan)
+        return np.concatenate([nees_at(error[k : k + 1], P[k : k + 1]) for k in range(len(error))])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
