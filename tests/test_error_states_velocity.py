@@ -472,10 +472,8 @@ def test_what_no_state_covers_is_reported():
 
 def errors_of(used: Recording, attitude: np.ndarray) -> dict[str, float]:
     """RMS errors over the movement, degrees."""
-    return {
-        part: value / DEGREE
-        for part, value in reference_errors(attitude, used.true_attitude).rms(used.movement).items()
-    }
+    errors = reference_errors(attitude, used.true_attitude)._asdict()
+    return {part: np.sqrt(np.nanmean(error[used.movement] ** 2)) / DEGREE for part, error in errors.items()}
 
 
 def errors_by(recording: Recording, parameters: ahrs.AhrsParameters, **options) -> dict[str, float]:

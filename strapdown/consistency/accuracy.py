@@ -29,8 +29,7 @@ FITTED = 4000
 """Maximum number of attitudes from which clocks and frames are aligned."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ReferenceErrors:
+class ReferenceErrors(NamedTuple):
     """Errors of an estimated attitude against a reference, as defined by the BROAD benchmark, rad; NaN where there is no reference."""
 
     total: Array
@@ -39,15 +38,6 @@ class ReferenceErrors:
     """Angle of its part about the vertical (n,)."""
     inclination: Array
     """Angle of the remaining rotation, between the two verticals (n,)."""
-
-    def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
-        """Return the RMS of each error, rad, over the samples with a reference; if given, only those of the ``movement`` mask."""
-        judged = np.isfinite(self.total) if movement is None else np.isfinite(self.total) & movement
-        if not judged.any():
-            raise InputError(
-                "no sample to judge has a valid reference attitude; check the movement mask and the reference"
-            )
-        return {kind: float(np.sqrt(np.mean(getattr(self, kind)[judged] ** 2))) for kind in KINDS}
 
 
 def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErrors:
@@ -85,7 +75,7 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     results[0, known] = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
     results[1, known] = 2.0 * np.arctan2(np.abs(z), np.abs(w))
     results[2, known] = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
-    return ReferenceErrors(total=results[0], heading=results[1], inclination=results[2])
+    return ReferenceErrors(*results)
 
 
 class ErrorSize(NamedTuple):

@@ -7,24 +7,23 @@ innovations, which the NIS shows.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, count, numbers
+from strapdown.checks import Array, InputError, array, numbers
 from strapdown.consistency.bounds import tail
 
 MAX_LAGS = 20
 
 
 def usual_lags(samples: int) -> int:
-    """Return the default number of lags of a whiteness test: a fiftieth of the samples, from 1 to 20."""
+    """Return the number of lags of a whiteness test: a fiftieth of the samples, from 1 to 20."""
     return max(1, min(MAX_LAGS, samples // 50))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Autocorrelation:
+class Autocorrelation(NamedTuple):
     """Autocorrelation of each component of a series."""
 
     lags: Array
@@ -32,40 +31,25 @@ class Autocorrelation:
     values: Array
     """Autocorrelation at each lag (L, dof)."""
     bounds: Array
-    """Half-width of the two-sided bounds of a single value (L,)."""
-    simultaneous_bounds: Array
     """Half-width of the bounds that hold for all values jointly (L,) (Bonferroni)."""
-    probability: float
 
 
-def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: float = 0.99) -> Autocorrelation:
-    """Return the autocorrelation of whitened innovations (n,) or (n, m) at lags 1 to ``lags``, of each component.
+def autocorrelation(whitened: ArrayLike, confidence_level: float = 0.99) -> Autocorrelation:
+    """Return the autocorrelation of whitened innovations (n,) or (n, m) at the :func:`usual_lags`, of each component.
 
-    Default: a fiftieth of the samples, at most 20 lags. The mean is known to be zero and is not subtracted. For white noise the value at
-    lag l is approximately normal with variance (N − l)/(N(N + 2)) (Ljung & Box 1978, Biometrika 65).
+    The mean is known to be zero and is not subtracted. For white noise the value at lag l is approximately normal with variance
+    (N − l)/(N(N + 2)) (Ljung & Box 1978, Biometrika 65).
     """
     from scipy.special import ndtri
 
     z = _series(whitened)
-    n = len(z)
-    number = count("lags", lags if lags is not None else usual_lags(n))
-    if number >= n:
-        raise InputError(f"lags is {number}, but there are {n} samples; take fewer")
-    power = np.sum(z * z, axis=0)
-    steps = np.arange(1, number + 1)
-    values = np.array([np.sum(z[lag:] * z[:-lag], axis=0) for lag in steps]) / power
-    spread = np.sqrt((n - steps) / (n * (n + 2.0)))
-    outside = tail(probability)
-    return Autocorrelation(
-        lags=steps.astype(np.float64),
-        values=values,
-        bounds=-ndtri(outside) * spread,
-        simultaneous_bounds=-ndtri(outside / values.size) * spread,
-        probability=probability,
-    )
+    n, lags = len(z), np.arange(1, usual_lags(len(z)) + 1)
+    values = np.array([np.sum(z[lag:] * z[:-lag], axis=0) for lag in lags]) / np.sum(z * z, axis=0)
+    sigma = np.sqrt((n - lags) / (n * (n + 2.0)))
+    return Autocorrelation(lags.astype(np.float64), values, -ndtri(tail(confidence_level) / values.size) * sigma)
 
 
-def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int, float]:
+def ljung_box(whitened: ArrayLike) -> tuple[float, int, float]:
     """Return the multivariate Ljung–Box statistic of whitened innovations (n,) or (n, m), its degrees of freedom and its p-value.
 
     ``Q = N(N + 2/m) Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom if the innovations are white. The test is
@@ -76,7 +60,7 @@ def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int,
 
     z = _series(whitened)
     n, m = z.shape
-    number = count("lags", lags if lags is not None else usual_lags(n))
+    number = usual_lags(n)
     if number >= n or n <= m:
         raise InputError(f"{n} samples are too few for {number} lags of {m} components")
     # With components of unit covariance the traces are sums of squares.

@@ -103,8 +103,7 @@ def _sensor(name: str, innovations: Innovations) -> str:
         ),
     ]
     correlation = consistency.autocorrelation(white)
-    bounds = correlation.simultaneous_bounds
-    lags = page.band(-bounds, bounds, ("99 % bounds, all lags", "lower bound"))
+    lags = page.band(-correlation.bounds, correlation.bounds, ("99 % bounds, all lags", "lower bound"))
     lags += page.lines(style.AXES if correlation.values.shape[1] > 1 else ["innovations"], correlation.values.T)
     nis, (low, high) = innovations.nis / white.shape[1], consistency.mean_bounds(white.shape[1], 1)
     curves = [np.maximum(nis, 1e-4)]
