@@ -422,7 +422,7 @@ def test_judged_epochs_are_marked_and_their_bounds_drawn(statistics, outcomes):
     ax = plots.coning_consistency(outcomes).axes[0]
     judged = next(line for line in ax.lines if line.get_label() == "judged epoch")
     np.testing.assert_array_equal(judged.get_xdata(), statistics.time[statistics.judged_epochs])
-    low, high = statistics.verdict(outcomes[0].epochs, "attitude", 0.99).simultaneous_bounds
+    low, high = statistics.verdict(statistics.judged_epochs, "attitude", 0.99).simultaneous_bounds
     band = next(patch for patch in ax.patches if "99 %" in patch.get_label())
     np.testing.assert_allclose(limits(band), [low, high])
 

@@ -23,7 +23,7 @@ from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import engine
-from strapdown.montecarlo.statistics import SUBSETS, Counts, Statistics
+from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.motion import Coning
 from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario
@@ -178,11 +178,6 @@ class FilterOutcome:
     integration: str
     statistics: Statistics
 
-    @property
-    def epochs(self) -> Counts:
-        """Indices of the epochs judged."""
-        return self.statistics.judged_epochs
-
     @functools.cached_property
     def judgement(self) -> Judgement:
         """Verdict on the filter, that of any Monte Carlo."""
@@ -193,11 +188,11 @@ class FilterOutcome:
 
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
         """
-        statistics, verdict = self.statistics, self.judgement.verdict
-        nees = {subset: statistics.verdict(self.epochs, subset) for subset in SUBSETS}
+        statistics, epochs, verdict = self.statistics, self.statistics.judged_epochs, self.judgement.verdict
+        nees = {subset: statistics.verdict(epochs, subset) for subset in SUBSETS}
         row: dict[str, Any] = {"integration": self.integration, "runs": statistics.runs}
         for what, values in (("rms", statistics.rms_error), ("sigma", statistics.sigma)):
-            square = values[self.epochs] ** 2
+            square = values[epochs] ** 2
             row[f"attitude_{what}_arcsec"] = float(np.sqrt(square[:, :3].mean()) / ARCSECOND)
             row[f"bias_{what}_deg_per_hour"] = float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR)
         for subset, part in nees.items():
@@ -205,8 +200,8 @@ class FilterOutcome:
             row |= {name: float(part.mean.mean()), f"{name}_bounds": list(part.bounds)}
         return {
             **row,
-            "bias_mean_deg_per_hour": (statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
-            "epochs": len(self.epochs),
+            "bias_mean_deg_per_hour": (statistics.mean_error[epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
+            "epochs": len(epochs),
             "epochs_outside": {subset: part.outside for subset, part in nees.items()},
             "nis": statistics.mean_nis,
             "nis_bounds": list(statistics.nis_bounds()),

@@ -86,12 +86,12 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter."""
     figure, axes = style.new_figure(1, 3, size=(10.5, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
-    first = outcomes[0]
+    first = outcomes[0].statistics
     percent = f"{100 * PROBABILITY:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        bounds = first.statistics.verdict(first.epochs, subset).simultaneous_bounds
+        bounds = first.verdict(first.judged_epochs, subset).simultaneous_bounds
         nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
-        epochs = first.statistics.time[first.epochs]
+        epochs = first.time[first.judged_epochs]
         below = {"transform": ax.get_xaxis_transform(), "color": style.ink(), "markersize": 5}
         ax.plot(epochs, np.full(len(epochs), 0.015), "|", label="judged epoch", **below)
         passing = _passing(outcomes, "ANEES", subset)

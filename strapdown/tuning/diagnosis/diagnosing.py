@@ -13,14 +13,13 @@ from strapdown import coning, consistency, estimation, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Judgement
 from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf, unmodelled
+from strapdown.estimation.setup.matching import ACCURATE_ALGORITHM
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
 from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers, shown
 from strapdown.tuning.diagnosis.likelihood import Model, Run, by_mean, by_variance, log_p, run
 from strapdown.units import DEGREE_PER_HOUR
 
-ACCURATE_ALGORITHM = "matched-1-8-8"
-"""Integration algorithm with which others are compared."""
 GROSS = 3.0
 """Conventions are tested if the NIS per degree of freedom of a sensor exceeds this, because a wrong one has a large effect."""
 

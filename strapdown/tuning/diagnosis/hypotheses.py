@@ -253,15 +253,10 @@ def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
 
 
 def _sensor_noise(sensor: str) -> Hypothesis:
-    return Hypothesis(
-        name="R",
-        of=sensor,
-        unit="ln of the factor on σ",
-        steps=np.array([0.1]),
-        limit=6.0,
-        apply=lambda model, theta: model.with_series(sensor, lambda s: s.noise_scaled(math.exp(theta[0]))),
-        words=lambda theta, _: f"the noise of {sensor} is {math.exp(theta[0]):.3g} times the filter's model",
-    )
+    def apply(model: Model, theta: Array) -> Model:
+        return model.with_series(sensor, lambda series: series.noise_scaled(math.exp(theta[0])))
+
+    return _noise("R", sensor, f"the noise of {sensor}", 0.1, apply)
 
 
 def _gyro_noise(term: str, name: str) -> Hypothesis:
@@ -269,14 +264,19 @@ def _gyro_noise(term: str, name: str) -> Hypothesis:
         size = getattr(model.noise, term) * math.exp(theta[0])
         return replace(model, noise=replace(model.noise, **{term: size}))
 
+    return _noise("Q", name, f"the gyro's {name}", 0.2, apply)
+
+
+def _noise(name: str, of: str, what: str, step: float, apply: Callable[[Model, Array], Model]) -> Hypothesis:
+    """Return the hypothesis of a factor on the σ of a noise."""
     return Hypothesis(
-        name="Q",
-        of=name,
+        name=name,
+        of=of,
         unit="ln of the factor on σ",
-        steps=np.array([0.2]),
+        steps=np.array([step]),
         limit=6.0,
         apply=apply,
-        words=lambda theta, _: f"the gyro's {name} is {math.exp(theta[0]):.3g} times the filter's model",
+        words=lambda theta, _: f"{what} is {math.exp(theta[0]):.3g} times the filter's model",
     )
 
 
