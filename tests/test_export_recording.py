@@ -198,6 +198,7 @@ def test_hostile_samples_set_a_flag_and_leave_the_filter_as_it_was(compiled):
     name, f = compiled
     f.start()
     assert f.take(0.0, [0.0] * 3, None, None) == 16  # waits for the vertical
+    assert f.take(0.0, [0.0] * 3, [0.0, -3000.0, 9.8], None) == 1  # beyond any accelerometer
     for k, (time, *vectors) in enumerate(case(name)[1][:600]):
         f.take(time, *vectors)
         f.library.strapdown_clear_status(ctypes.byref(f.state))

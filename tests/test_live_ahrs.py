@@ -146,6 +146,7 @@ def test_it_starts_at_the_first_specific_force():
         ((0.31, (0, np.nan, 0), (0, 0, 9.8)), "gyro has a NaN"),
         ((0.31, (0, 1e5, 0), (0, 0, 9.8)), r"give finite numbers, rates in rad/s"),
         ((0.31, (0, 0, 0), (0, 0, np.inf)), r"give finite numbers"),
+        ((0.31, (0, 0, 0), (0, -3000, 9.8)), r"specific force in m/s² below 1000"),
         ((0.31, (0, 0), (0, 0, 9.8)), r"gyro is \(0, 0\); give three numbers"),
         ((0.31, (0, 0, 0), "abc"), r"accelerometer is 'abc'; give three numbers"),
         ((10**400, (0, 0, 0), (0, 0, 9.8)), r"time is 1000+; give one number"),

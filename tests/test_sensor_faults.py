@@ -355,6 +355,18 @@ def test_a_clipped_accelerometer_is_left_out():
     assert f"clipped in {np.sum(lost)} samples" in faults.words[0]
 
 
+def test_a_specific_force_beyond_any_accelerometer_is_left_out():
+    plain = swing(10.0)
+    force = plain.specific_force.copy()
+    force[1000, 1] = 3000.0
+    recording = dataclasses.replace(plain, specific_force=force)
+    faults = sensor_faults.find(recording)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(faults.recording.specific_force).any(axis=1)), [1000])
+    assert "beyond 1000 m/s²: 1, ignored" in faults.words[0]
+    whole, damaged = (ahrs.estimate(x, latency=0.0).estimate.attitude for x in (plain, recording))
+    assert quaternion.angle_between(whole, damaged).max() < 0.5 * DEGREE
+
+
 def test_an_ordinary_recording_has_no_faults():
     faults = sensor_faults.find(swing(10.0))
     assert faults.words == ()

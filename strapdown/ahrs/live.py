@@ -26,7 +26,7 @@ from strapdown.kernels.live import TOO_PRECISE
 from strapdown.kernels.machine import address_of, compiled, read_only
 from strapdown.kernels.recording_steps import Carried, Stamps, Steps
 from strapdown.recordings.sensor_delays import ASSUMED_SIGMA, GIVEN_SIGMA
-from strapdown.records.recording import LARGEST_RATE, Recording
+from strapdown.records.recording import LARGEST_FORCE, LARGEST_RATE, Recording
 from strapdown.vectors import VectorMeasurements
 
 MAX_SAMPLES_RATIO = 4
@@ -142,6 +142,7 @@ class LiveAhrs:
             step=parameters.step,
             noise=parameters.specific_force_noise,
             largest_rate=LARGEST_RATE,
+            largest_force=LARGEST_FORCE,
             late=late,
             time=time,
             gyro=gyro,
@@ -249,8 +250,8 @@ class LiveAhrs:
         Raises
         ------
         InputError
-            If the time is not after that of the last sample, or by more than an hour, or a number of the gyro is missing or infinite. The
-            filter is then unchanged.
+            If the time is not after that of the last sample, or by more than an hour, a number of the gyro is missing, a number is
+            infinite, or the specific force is above 1000 m/s². The filter is then unchanged.
         """
         call, name, sample = self._call, "time", time
         rate: Any = gyro
@@ -329,7 +330,8 @@ class LiveAhrs:
                 kernel.BEHIND: f"time is {time:.9g} s, not after the last sample; give samples in order",
                 kernel.AHEAD: f"time is {time:.9g} s, more than an hour after the last sample; start a new LiveAhrs if its clock jumped",
                 kernel.NO_GYRO: "gyro has a NaN; omit the sample",
-                kernel.INFINITE: f"gyro, accelerometer and magnetometer are {numbers}; give finite numbers, rates in rad/s",
+                kernel.INFINITE: f"gyro, accelerometer and magnetometer are {numbers}; give finite numbers, rates in rad/s, "
+                f"specific force in m/s² below {LARGEST_FORCE:g}",
                 kernel.TOO_FAST: f"the interval of the samples is far below {self.interval:g} s, their usual interval",
             }[code]
         )

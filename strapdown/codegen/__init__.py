@@ -32,6 +32,7 @@ from strapdown.codegen.target import traced
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
 from strapdown.files import atomic_write, usable_folder, writable
 from strapdown.records import ImuRecord
+from strapdown.records.recording import LARGEST_FORCE
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
 if TYPE_CHECKING:
@@ -172,7 +173,8 @@ def _origin(setup: FilterSetup | LiveAhrs, precision: str) -> str:
     prose += [
         f"For an IMU {field} a magnetometer and samples every {setup.interval:g} s, as strapdown.LiveAhrs. Fixed axes: East, (magnetic) "
         "North, up; without a magnetometer the first heading is arbitrary. Times are double in single precision too. A gap of up to an "
-        "hour is bridged; samples that come more than four times as fast as these are not used.",
+        "hour is bridged. Samples that come more than four times as fast as these are not used, nor those of a specific force above "
+        f"{LARGEST_FORCE:g} m/s^2.",
         "",
     ]
     return "\n".join(

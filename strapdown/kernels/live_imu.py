@@ -162,6 +162,7 @@ class Imu(NamedTuple):
     noise: float
     """Noise density of the specific force, m/s²/√Hz."""
     largest_rate: float
+    largest_force: float
     late: float
     """Delay of the samples, s."""
     time: np.ndarray
@@ -219,7 +220,7 @@ def refusal(imu):
             return NO_GYRO
         if (
             abs(imu.gyro[0, i]) > imu.largest_rate
-            or abs(imu.accelerometer[0, i]) == math.inf
+            or abs(imu.accelerometer[0, i]) > imu.largest_force
             or abs(imu.magnetic[0, i]) == math.inf
         ):
             return INFINITE

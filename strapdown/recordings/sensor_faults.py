@@ -5,7 +5,8 @@ rest differs from that in motion: half a step is added (:func:`truncation_step`)
 
 A clipped gyro sample is a lower bound of the rate. The rate of a run of clipped samples is restored by a cubic between the samples before
 and after (:func:`restored`). Its error is represented by a variance of the rotation about the clipped axis, which the filter adds to its
-own, as it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out.
+own, as it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out, and one beyond
+the range of any (``LARGEST_FORCE``).
 
 Where a recording was resampled, a gap of its sensors can be filled by a straight line, which is no measurement: the rotation over it is as
 uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
@@ -22,7 +23,7 @@ from strapdown.checks import Array, median
 from strapdown.kernels import recording_samples
 from strapdown.kernels.alignment import UNKNOWN_TURN
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import SENSORS, Recording, corrected
+from strapdown.records.recording import LARGEST_FORCE, SENSORS, Recording, corrected
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
@@ -100,6 +101,11 @@ def find(recording: Recording) -> Faults:
             f"The gyro was clipped: {limits} of the samples. The rate is restored from adjacent samples, and σ grows over each run"
         )
     force = recording.specific_force
+    if force is not None:
+        beyond = np.asarray((np.abs(force) > LARGEST_FORCE).any(axis=1))
+        if 0.0 < beyond.mean() < 0.5:  # otherwise the unit is wrong, which the tests of the conventions report
+            changes["specific_force"] = force = np.where(beyond[:, None], np.nan, force)
+            words.append(f"Samples of the accelerometer beyond {LARGEST_FORCE:g} m/s²: {np.sum(beyond)}, ignored")
     if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
         lost = np.asarray(saturated.any(axis=1))
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)

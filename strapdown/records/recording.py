@@ -47,6 +47,9 @@ LONGEST_GAP = 30.0 * 86400.0
 LARGEST_RATE = 2000.0
 """Maximum rate, rad/s, five times the range of the fastest gyros. Larger values are raw counts or a damaged row, and a filter would divide
 each interval into thousands of steps."""
+LARGEST_FORCE = 1000.0
+"""Maximum specific force, m/s², of a sample that is used: 100 g, beyond the accelerometers of attitude units. A single damaged sample
+above it can turn the attitude over, for minutes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
