@@ -51,6 +51,13 @@ def test_an_interrupted_write_leaves_what_was_there_and_no_temporary(tmp_path, e
     assert not before or target.read_text() == "old"
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")
+def test_a_full_disk_is_reported_with_the_file(tmp_path):
+    with pytest.raises(OSError, match=r"No space left on device: '\S+result.h5'"):
+        with atomic_write(tmp_path / "result.h5"), open("/dev/full", "w") as full:
+            full.write("content")
+
+
 def test_two_writers_at_once_do_not_meet(tmp_path):
     target = tmp_path / "result.txt"
     with atomic_write(target) as first, atomic_write(target) as second:

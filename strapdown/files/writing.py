@@ -43,6 +43,10 @@ def atomic_write(path: str | os.PathLike[str], *, durable: bool = False) -> Iter
             with open(temporary, "r+b") as file:
                 os.fsync(file.fileno())
         os.replace(temporary, target)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # as of a full disk
+            error.filename = os.fspath(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
