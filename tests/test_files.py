@@ -53,9 +53,9 @@ def test_an_interrupted_write_leaves_what_was_there_and_no_temporary(tmp_path, e
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")
 def test_a_full_disk_is_reported_with_the_file(tmp_path):
-    with pytest.raises(OSError, match=r"No space left on device: '\S+result.h5'"):
-        with atomic_write(tmp_path / "result.h5"), open("/dev/full", "w") as full:
-            full.write("content")
+    refused = pytest.raises(OSError, match=r"No space left on device: '\S+result.h5'")
+    with refused, atomic_write(tmp_path / "result.h5"), open("/dev/full", "w") as full:
+        full.write("content")
 
 
 def test_two_writers_at_once_do_not_meet(tmp_path):

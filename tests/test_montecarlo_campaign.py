@@ -187,7 +187,10 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
         ({"plan": replace(PLAN, nis_bins=4)}, "nis_bins is 5 there and 4 here"),
         ({"plan": replace(PLAN, setup=replace(SETUP, attitude_sigma=0.1))}, "filter.attitude_sigma_deg is"),
         ({"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8))}, "scenario.duration_s is 2.4 there and 4.8"),
-        ({"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8, name="other"))}, "scenario.name is .* there and other"),
+        (
+            {"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8, name="other"))},
+            "scenario.name is .* there and other",
+        ),
         (
             {"plan": replace(PLAN, scenario=replace(SCENARIO, name="other"), setup=replace(SETUP, attitude_sigma=0.1))},
             "scenario.name is spin there and other here",  # not the filter, which follows from it

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import CancelledError
 from dataclasses import replace
 
@@ -174,6 +175,30 @@ def test_worker_processes_give_the_bits_of_one_process(workers, machine):
     with cluster.dask_client(workers=workers) as client:
         statistics = montecarlo.run_plan(PLAN, runs=60, chunk=4, machine=machine, workers=cluster.on_dask(client))
     assert_same(statistics, montecarlo.run_plan(PLAN, runs=60, chunk=4, threads=1, machine=machine))
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_campaign_on_worker_processes_without_their_tracebacks(tmp_path):
+    """A terminal sends it to the workers too."""
+    command = [sys.executable, "-m", "strapdown", "montecarlo", "two-stars", "--runs", "100000", "--workers", "2"]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "c.h5")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        text=True,
+    )
+    try:
+        while not (tmp_path / "c.h5").exists() or montecarlo.campaign.read(tmp_path / "c.h5").finished_runs == 0:
+            assert process.poll() is None
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)
+        printed = process.communicate(timeout=60)[0]
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "continue with --resume" in printed
+    assert "Traceback" not in printed
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import pickle
+import signal
 from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
 from threading import Event
@@ -79,7 +80,13 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
         silence_logs="ERROR",
     )
     with cluster, distributed.Client(cluster, set_as_default=False) as client:
+        client.run(_ignore_ctrl_c)
         yield client
+
+
+def _ignore_ctrl_c() -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def on_dask(client: Any) -> Workers:
