@@ -192,8 +192,7 @@ def update(f: Any, time: Any, gyro: Any, accelerometer: Any, magnetometer: Any =
     usable = time >= -1e15 and time <= 1e15
     for x in gyro:
         usable = usable and abs(x) <= imu.largest_rate
-    for x in accelerometer:
-        usable = usable and abs(x) <= imu.largest_force
+    usable = usable and dot(accelerometer, accelerometer) <= imu.largest_force * imu.largest_force
     for vector in vectors:
         square = dot(vector, vector)
         usable = usable and (square >= body.SHORTEST_SQUARED or square == 0.0) and square <= body.LONGEST_SQUARED

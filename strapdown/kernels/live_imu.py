@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from strapdown.kernels.algebra import dot
 from strapdown.kernels.alignment import LARGE_TURN, SIZE, UNKNOWN, UNKNOWN_TURN, align_steps
 from strapdown.kernels.argument_tables import call, unpacked
 from strapdown.kernels.headings import heading_steps
 from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
+from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.recording_steps import (
     average_samples,
     carry_to_stamps,
@@ -215,14 +217,12 @@ def refusal(imu):
         return NO_TIME
     if started and not a.clock[0] < imu.time[0] <= a.clock[0] + MAX_INTERVAL:
         return BEHIND if imu.time[0] <= a.clock[0] else AHEAD
+    force = vector_at(imu.accelerometer, 0)
+    large = dot(force, force) > imu.largest_force * imu.largest_force
     for i in range(3):
         if math.isnan(imu.gyro[0, i]):
             return NO_GYRO
-        if (
-            abs(imu.gyro[0, i]) > imu.largest_rate
-            or abs(imu.accelerometer[0, i]) > imu.largest_force
-            or abs(imu.magnetic[0, i]) == math.inf
-        ):
+        if large or abs(imu.gyro[0, i]) > imu.largest_rate or abs(imu.magnetic[0, i]) == math.inf:
             return INFINITE
     if started and a.count[1] + 1 >= len(a.force):
         return TOO_FAST
