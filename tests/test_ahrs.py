@@ -814,6 +814,24 @@ def test_how_late_the_magnetometer_is_shows_beside_the_gyro(behind):
     assert np.all(sensor_delays.find(late(field=behind)).field == used)
 
 
+@pytest.mark.parametrize("behind", [-0.2, 0.1, 0.2])
+def test_a_long_delay_of_the_magnetometer_is_found_and_compensated(behind):
+    """Beyond the linear fit, which takes 0.2 s for a few milliseconds with a small σ."""
+    shown = late(field=behind)
+    delay, sigma = sensor_delays.magnetometer_delay(shown)
+    assert sigma < 3e-4
+    assert delay == pytest.approx(behind, abs=1e-3)
+    used = sensor_delays.find(shown, causal=True).field
+    np.testing.assert_allclose(used, behind, atol=0.02)  # from the first sample on
+    assert used[-1] == pytest.approx(behind, abs=1e-3)
+
+
+def test_a_long_delay_that_the_motion_does_not_refine_is_reported_with_its_sigma():
+    found = sensor_delays.find(late(field=0.2, bias=(10.0, -6.0, 8.0)))
+    assert found.last_field == pytest.approx(0.2, abs=2.0 * found.field_sigma + 5e-3)
+    assert 1e-3 < found.field_sigma <= sensor_delays.SEARCH_SIGMA
+
+
 @pytest.mark.parametrize("behind", [-0.008, 0.0, 0.011])
 def test_hard_iron_is_no_delay(behind):
     """Nearly a third of the field; of a delay it hides some."""

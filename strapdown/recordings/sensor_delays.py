@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, median, non_negative
 from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -19,6 +20,15 @@ FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
 PAIRS_IN_SPAN = 6
 """Number of pairs of field samples per span; more are not independent."""
+LONGEST_DELAY = 0.5
+"""Maximum delay of the magnetometer that is looked for, s."""
+SEARCHED_PAIRS = 300
+"""Number of pairs of field samples in the search for a long delay."""
+LONG_MISFIT = 0.5
+"""Mean square change of the field at a long delay, relative to that at a short one, below which the delay is long. In 91 public recordings,
+none of which has one, it is 1; with a delay of 0.2 s added it is mostly below 0.3."""
+SEARCH_SIGMA = 0.02
+"""σ of a long delay that the fit does not refine, s: the search has steps of 33 ms, and a slow motion shows no better."""
 MAX_DELAY_SIGMA = 2e-3
 """Maximum σ of a delay of the magnetometer that is used, s."""
 ASSUMED_SIGMA = 2e-3
@@ -77,7 +87,8 @@ def find(
 
     ``latency`` is the delay of gyro and accelerometer, s, if known. The default is half a sample interval, as for means over the interval
     before the stamp. ``field`` is the delay of the magnetometer relative to the gyro, s, if known. ``causal``: each sample's delay is
-    computed from the samples before it, and updated whenever the duration has doubled. ``turned`` (n, 4): attitude from the gyro only, if
+    computed from the samples before it, and updated whenever the duration has doubled; only whether it is long, beyond the linear fit, is
+    found from all samples. ``turned`` (n, 4): attitude from the gyro only, if
     already computed.
     """
     length = recording.time[-1] - recording.time[0]
@@ -86,16 +97,19 @@ def find(
     field_delay = np.full(len(recording.time), field or 0.0)
     sigma = GIVEN_SIGMA if field is not None else np.inf
     if field is None and recording.magnetic_field is not None:
-        evidence = _evidence(recording, gyro_attitude(recording) if turned is None else turned)
+        long, evidence = _evidence(recording, gyro_attitude(recording) if turned is None else turned)
+        field_delay[:] = long
         spans = [1.0] if causal else [length]
         while spans[-1] < length:
             spans.append(2.0 * spans[-1])
         for span in spans:
             until = np.searchsorted(evidence[0], recording.time[0] + span, side="right")
-            delay, sigma = _fitted(*(part[:until] for part in evidence[1:]))
+            remainder, sigma = _fitted(*(part[:until] for part in evidence[1:]))
+            delay = long + remainder
             if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay):
                 since = recording.time[0] + span if causal else recording.time[0]
                 field_delay[np.searchsorted(recording.time, since) :] = delay
+        sigma = SEARCH_SIGMA if long and sigma >= MAX_DELAY_SIGMA else sigma
     return Delays(
         gyro=0.5 * recording.interval if latency is None else latency,
         sigma=ASSUMED_SIGMA if latency is None else GIVEN_SIGMA,
@@ -111,12 +125,13 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
     In the frame fixed by the integrated gyro the field m is constant over a fraction of a second. Samples that are late by τ have the error
     ``−τ ṁ``, ``ṁ = −w × m``; the change of this error over :data:`FIELD_SPAN` is fitted by least squares without outliers. A field that
     rotates with the body (hard iron) is in quadrature with it in a swing: it does not appear as a delay, but large iron masks part of one.
+    A delay too long for this linear fit, up to :data:`LONGEST_DELAY`, is first found by a search.
     """
-    return (
-        (0.0, np.inf)
-        if recording.magnetic_field is None
-        else _fitted(*_evidence(recording, gyro_attitude(recording))[1:])
-    )
+    if recording.magnetic_field is None:
+        return 0.0, np.inf
+    long, evidence = _evidence(recording, gyro_attitude(recording))
+    delay, sigma = _fitted(*evidence[1:])
+    return long + delay, sigma
 
 
 def gyro_attitude(recording: Recording) -> Array:
@@ -127,21 +142,57 @@ def gyro_attitude(recording: Recording) -> Array:
     return attitude
 
 
-def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array, Array]:
-    """Return times (m,), s, of pairs of field samples, and the products c·w, w·w, c·c of their change c and that by a unit delay, w."""
+def _evidence(recording: Recording, turned: Array) -> tuple[float, tuple[Array, Array, Array, Array]]:
+    """Return the long part of the delay, s, and the evidence of the rest.
+
+    That is times (m,), s, of pairs of field samples, and the products c·w, w·w, c·c of their change c and that by a unit delay, w.
+    """
     time = recording.time
     assert recording.magnetic_field is not None
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
     if len(time) < 10 * lag:
-        return (np.empty(0),) * 4
+        return 0.0, (np.empty(0),) * 4
     stride = max(1, lag // PAIRS_IN_SPAN)
     lag = max(1, lag // stride)
+    shift = stride * _long_shift(recording, turned, stride, lag)
+    field = _shifted(recording.magnetic_field, shift)
     at = time[::stride]
     still, late, products = np.empty((len(at), 3)), np.empty((len(at), 3)), np.empty((len(at) - lag, 3))
-    arrays = (read_only(column) for column in (recording.rate, recording.magnetic_field, turned))
+    arrays = (read_only(column) for column in (recording.rate, field, turned))
     compiled(recording_samples.field_changes)(*arrays, stride, lag, still, late, products)
     pairs = np.isfinite(products[:, 1])
-    return at[lag:][pairs], *products[pairs].T.copy()
+    return shift * recording.interval, (at[lag:][pairs], *products[pairs].T.copy())
+
+
+def _long_shift(recording: Recording, turned: Array, stride: int, lag: int) -> int:
+    """Return the delay of the field in strides of rows at which it changes least in the frame fixed by the gyro; 0 unless it is long."""
+    field, longest = recording.magnetic_field, int(LONGEST_DELAY / (stride * recording.interval))
+    assert field is not None
+    begin, end = stride * longest, len(field) - stride * (longest + lag)
+    rows = np.linspace(begin, end, SEARCHED_PAIRS, endpoint=False, dtype=int) if begin < end else np.empty(0, int)
+    if longest < 2 or len(rows) == 0:
+        return 0
+    shifts = np.arange(-longest, longest + 1)
+    first, last = (
+        quaternion.to_matrix(turned[at]) @ np.swapaxes(field[at[:, None] + stride * shifts], 1, 2)
+        for at in (rows, rows + stride * lag)
+    )
+    square = np.sum((last - first) ** 2, axis=1)
+    known = np.isfinite(square).all(axis=1)
+    if not known.any():
+        return 0
+    misfit = square[known].mean(axis=0)
+    is_short = np.abs(shifts) < 2
+    return int(shifts[np.argmin(misfit)]) if misfit.min() < LONG_MISFIT * misfit[is_short].min() else 0
+
+
+def _shifted(samples: Array, rows: int) -> Array:
+    """Return samples (n, 3) moved up by that many rows; NaN at the end, or at the beginning if ``rows`` is negative."""
+    if rows == 0:
+        return samples
+    moved = np.roll(samples, -rows, axis=0)
+    moved[slice(-rows, None) if rows > 0 else slice(-rows)] = np.nan
+    return moved
 
 
 def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
