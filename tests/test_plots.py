@@ -160,6 +160,17 @@ def test_a_slice_of_the_likelihood_is_drawn_in_the_unit_of_its_axis(start):
         assert ax.get_xlabel() == f"°/h  (before: {start / units.DEGREE_PER_HOUR:.3g})"
 
 
+def test_the_legend_of_one_slice_of_the_likelihood_is_within_its_figure():
+    unit = SimpleNamespace(name="1", factor=1.0)
+    parameter = SimpleNamespace(name="scale", unit=unit, start=1.2, value=1.0, lower=0.8, upper=1.5, identified=True)
+    slices = SimpleNamespace(values=np.geomspace(0.5, 2.0, 9)[None], fallen=np.arange(9.0)[None])
+    figure = tuning.likelihood_slices(slices, SimpleNamespace(parameters=(parameter,), composite=False))
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert 0.0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+
+
 def test_an_allan_deviation_is_drawn_with_the_terms_of_its_axis():
     random = np.random.default_rng(2)
     white = 1e-3 * random.standard_normal((3000, 2))

@@ -471,6 +471,7 @@ PROBE = """const wait = setInterval(async () => {
     const press = (place, name) => place.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
     await soon();
     found.begin = seen();
+    found.label = drawn[0].plot.axes[1].values(drawn[0].plot, [2e-5])[0];
     found.samples = drawn[0].plot.data[0].length;
     press(drawn[1].place, "+"); await soon(); press(drawn[1].place, "+"); await soon();
     found.zoomed = seen();
@@ -517,6 +518,7 @@ def test_a_browser_shows_figures_and_charts(folder, name, width):
     assert reported["charts"] == (13 if name == "right" else 12)
     assert (reported["unnamed"], reported["dead"]) == (0, 0)
     assert reported["contents"] >= 5
+    assert float(reported["label"]) == 2e-5
     whole, zoomed = np.array(reported["begin"]), np.array(reported["zoomed"])
     over_time = np.array([chart["x"] == "time, s" for chart in charts_of(body(folder / f"{name}.html"))])
     np.testing.assert_allclose(

@@ -66,5 +66,5 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
         ax.set_visible(False)
     for ax in axes[:, 0]:
         ax.set_ylabel(measure_of(tuning.composite))
-    style.legend_below(figure, list(axes.ravel()), ncols=5)
+    style.legend_below(figure, list(axes.ravel()), ncols=2 * columns - 1)
     return figure

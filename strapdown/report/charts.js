@@ -59,7 +59,12 @@
       ? { splits: () => content.ticks.map((_, k) => k), values: () => content.ticks, rotate: (u) => (steep(u) ? 30 : 0), size: (u) => (steep(u) ? 70 : 36) }
       : {};
     const decades = (u, splits) => splits.map((value) => (Math.abs(Math.log10(value) - Math.round(Math.log10(value))) < 1e-9 ? value : null));
-    const grid = (log) => ({ ...axis.grid, ...(log ? { filter: decades } : {}) }); // its lines between decades would be a grey area
+    const written = (u, splits) => splits.map((value) => (value == null ? "" : String(Number(value.toPrecision(6))))); // uPlot rounds to 0.001
+    const scale = (log) => ({
+      ...axis,
+      values: written,
+      ...(log ? { grid: { ...axis.grid, filter: decades }, ticks: { ...axis.ticks, filter: decades } } : {}), // those between decades would be a grey area
+    });
     const vertical = content.range
       ? { range: (u, low, high) => (u.zoomed ? [low, high] : content.range) }
       : content.log ? { distr: 3 } : {};
@@ -76,8 +81,8 @@
         cursor: { sync: named ? undefined : { key: content.x }, drag: { x: true, y: false } },
         scales: { x: { time: false, distr: content.log_x ? 3 : 1, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
         axes: [
-          { ...axis, grid: grid(content.log_x), label: named ? undefined : content.x, ...names },
-          { ...axis, grid: grid(content.log), label: content.unit, size: 70 },
+          { ...scale(content.log_x), label: named ? undefined : content.x, ...names },
+          { ...scale(content.log), label: content.unit, size: 70 },
         ],
         series: [
           { label: content.x, value: named ? (u, value) => content.ticks[value] ?? "–" : shown },
