@@ -41,6 +41,7 @@ HEADERS = {
     "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),magnetometerX(µT),magnetometerY(µT),magnetometerZ(µT)",
     "blackbox": "time (s),gyroADC[0] (deg/s),gyroADC[1] (deg/s),gyroADC[2] (deg/s),accSmooth[0] (g),accSmooth[1] (g),accSmooth[2] (g),"
     "magADC[0] (uT),magADC[1] (uT),magADC[2] (uT)",
+    "symbols": "seconds,omega_x [deg/s],omega_y,omega_z,acc_x [g],acc_y,acc_z,B_x [uT],B_y,B_z",
     "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
     "joined, unit": "time,gyrox_dps,gyroy_dps,gyroz_dps,accx_g,accy_g,accz_g,magx_uT,magy_uT,magz_uT",
 }
@@ -83,6 +84,9 @@ def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
         read(table(header, values=VALUES[:, :7] * [2.5, 1, 1, 1, 1, 1, 1], name="slow.csv"))
     with pytest.raises(InputError, match=r"stamps of timestamp are 4e-07 apart.*not plausible in seconds"):
         read(table(header, values=VALUES[:, :7] * [4e-7, 1, 1, 1, 1, 1, 1], name="fast.csv"))
+    unsorted = table(header, values=VALUES[::-1, :7] * [4000.0, 1, 1, 1, 1, 1, 1], name="back.csv")
+    with pytest.raises(InputError, match=r"time\[1\] goes back to .* sort the rows"):
+        read(unsorted)
     recording = read(path, units={"time": "us"})
     np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
     np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])

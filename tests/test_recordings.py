@@ -322,7 +322,7 @@ def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     np.testing.assert_array_equal(twice.specific_force, once.specific_force)
     np.testing.assert_array_equal(twice.repeated, [0.02, 0.02, 0.05])
     np.testing.assert_array_equal(twice.taken(slice(3, None)).repeated, [0.05])
-    assert twice.left_out_words == "3 rows that repeat the row before, the first at 0.020 s, were left out."
+    assert twice.left_out_words == "3 rows with the stamp of the row before, the first at 0.020 s, were left out."
     assert once.left_out_words == ""
     missing = rows[2].replace("0.2,0,0", ",0,0")
     both = read(csv(rows=[*rows[:2], missing, missing, *rows[3:]]))

@@ -75,7 +75,7 @@ _WORDS = {
 _OTHER = {"linear", "lin", "user", "gravity", "free", "world", "earth", "global", "nav", "bias", "std", "sigma", "cov"}
 _OTHER |= {"covariance", "var", "variance", "offset", "delta", "filtered", "temperature", "temp"}
 """Words in names of columns that are not samples of a sensor."""
-_TIMES = ("time", "timestamp", "timestamps", "t", "stamp", "ts", "seconds elapsed")
+_TIMES = ("time", "timestamp", "timestamps", "t", "stamp", "ts", "seconds elapsed", "seconds", "datetime", "date")
 
 
 @dataclass(frozen=True)
@@ -262,13 +262,7 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         return ((hits[0],), "degC") if usable else None
     if group not in SENSORS:
         return None
-    groups: dict[tuple[str, ...], dict[int, tuple[int, str]]] = {}
-    for k, column in enumerate(columns):
-        parted = _axis(group, column.name)
-        if parted is not None:
-            prefix, axis, unit = parted
-            groups.setdefault(prefix, {})[axis] = (k, unit)
-    whole = [(prefix, axes) for prefix, axes in groups.items() if len(axes) == 3]
+    whole = _triples(group, columns) or _triples(group, columns, by_unit=True)  # B_x [uT]
     if len(whole) > 1:
         said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
         role = GROUPS[group][0]
@@ -282,8 +276,30 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
     return tuple(axes[axis][0] for axis in range(3)), axes[0][1]
 
 
-def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
-    """Return a column's name without its axis, the axis, and the unit in the name; None if it is not an axis of that sensor."""
+def _triples(
+    group: str, columns: Sequence[Column], *, by_unit: bool = False
+) -> list[tuple[tuple[str, ...], dict[int, tuple[int, str]]]]:
+    """Return the triples of columns of a sensor by their names: the words before the axis, and the place and unit of each axis.
+
+    ``by_unit``: whatever their names, those that declare a unit of this sensor only.
+    """
+    groups: dict[tuple[str, ...], dict[int, tuple[int, str]]] = {}
+    declared: set[tuple[str, ...]] = set()
+    for k, column in enumerate(columns):
+        parted = _axis(group, column.name, is_known=by_unit)
+        if parted is not None:
+            prefix, axis, unit = parted
+            groups.setdefault(prefix, {})[axis] = (k, unit)
+            if [sensor for sensor in SENSORS if unit_of(sensor, column.unit)] == [group]:
+                declared.add(prefix)
+    return [(prefix, axes) for prefix, axes in groups.items() if len(axes) == 3 and (prefix in declared or not by_unit)]
+
+
+def _axis(group: str, name: str, *, is_known: bool) -> tuple[tuple[str, ...], int, str] | None:
+    """Return a column's name without its axis, the axis, and the unit in the name; None if it is not an axis of that sensor.
+
+    ``is_known``: whether the sensor is known without the name.
+    """
     words: list[str] = []
     for word in _words(name):
         joined = re.fullmatch(r"([a-z]+)([xyz])", word)
@@ -296,7 +312,9 @@ def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
     unit = unit_of(group, "".join(after)) if after else ""
     if after and not unit:
         return None
-    known = before and (before[0] in _WORDS[group] or any(len(word) > 2 for word in _WORDS[group] & set(before)))
+    known = is_known or (
+        before and (before[0] in _WORDS[group] or any(len(word) > 2 for word in _WORDS[group] & set(before)))
+    )
     foreign = set(before) & _OTHER
     if "linear_acceleration" in name.lower():  # the field of a ROS message, which includes gravity
         foreign -= {"linear"}
@@ -367,7 +385,9 @@ USUAL_INTERVALS = (1e-6, 2.0)
 
 def _need_time_unit(source: str, name: str, time: Array) -> None:
     """Reject stamps of an undeclared unit that cannot be seconds of an inertial sensor; flight logs mostly have microseconds."""
-    steps = np.abs(np.diff(time))
+    steps = np.diff(time)
+    if np.any(steps < 0.0):
+        return  # is refused for that
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
         low, high = USUAL_INTERVALS

@@ -18,7 +18,7 @@ from strapdown.checks import Array, InputError, numbers
 from strapdown.files import atomic_write, reading
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
-from strapdown.recordings.delimited import write_columns
+from strapdown.recordings.delimited import date_ns, write_columns
 from strapdown.records import Estimate
 from strapdown.records.recording import CLOCK_OFFSET, FIELDS, Recording
 
@@ -34,7 +34,7 @@ def from_table(
 
     ``source`` is its name in messages; options as for :func:`strapdown.read`.
     """
-    held = _columns(source, table)
+    held = {name: _dates(column) for name, column in _columns(source, table).items()}
     names, arrays = list(held), list(held.values())
     for name, column in held.items():
         if np.shape(column) != np.shape(arrays[0]) or np.ndim(column) != 1:
@@ -95,6 +95,14 @@ def _plain(series: Any) -> NDArray[np.generic]:
     elif getattr(series.dtype, "kind", "O") in "iuf" and series.isna().any():
         options = {"dtype": np.float64, "na_value": np.nan}
     return np.asarray(series.to_numpy(**options))
+
+
+def _dates(column: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return dates as texts or objects as datetime64, UTC; other columns unchanged."""
+    if column.dtype.kind not in "OSUT" or column.ndim != 1 or len(column) == 0 or date_ns(str(column[0])) is None:
+        return column
+    counts = [date_ns(str(value)) for value in column]
+    return np.array([np.datetime64("NaT") if count is None else np.datetime64(count, "ns") for count in counts])
 
 
 def _unmasked(values: Any) -> NDArray[np.generic]:

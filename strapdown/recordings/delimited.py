@@ -85,7 +85,7 @@ class Table:
     def _number(self, row: int, place: int, cell: str, time: bool) -> float:
         """Return a cell's number; it may have a decimal comma if that is not the separator, and a time may be a date."""
         try:
-            if time and (date := _date(cell)) is not None:
+            if time and (date := date_ns(cell)) is not None:
                 return float(date)
             return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
         except ValueError:
@@ -94,8 +94,8 @@ class Table:
 
     def clock_ns(self, unit: str) -> NDArray[np.int64] | None:
         """Return the loaded stamps, of a unit, "" if unknown, if they are dates, or integers that count ns from 1970; else None."""
-        if _date(self._stamps[0]) is not None:
-            stamps = list(map(_date, self._stamps))
+        if date_ns(self._stamps[0]) is not None:
+            stamps = list(map(date_ns, self._stamps))
         elif unit in ("", "ns") and all(re.fullmatch(r"\s*\d{18,19}\s*", cell) for cell in self._stamps):
             stamps = list(map(int, self._stamps))
         else:
@@ -136,7 +136,7 @@ def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]
     return names, separator, first
 
 
-def _date(cell: str) -> int | None:
+def date_ns(cell: str) -> int | None:
     """Return an ISO 8601 date and time in ns since 1970, UTC if it has no time zone; None for other text."""
     if not re.match(r"\s*\d{4}-\d\d-\d\d[T ]", cell):
         return None

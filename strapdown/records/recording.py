@@ -225,7 +225,7 @@ class Recording(Listed):
             )
         if len(self.repeated):
             words.append(
-                f"{len(self.repeated)} rows that repeat the row before, the first at {self.repeated[0]:.3f} s, were left out."
+                f"{len(self.repeated)} rows with the stamp of the row before, the first at {self.repeated[0]:.3f} s, were left out."
             )
         return " ".join(words)
 
