@@ -148,7 +148,7 @@ def test_missing_motion_is_said():
     assert delay.endswith("σ of magnetometer delay is 6 ms, good is 3.")
 
 
-def test_acceleration_that_lasts_is_no_error_of_a_unit(turned):
+def test_acceleration_that_lasts_is_no_error_of_a_unit(turned, tmp_path):
     """A multirotor in flight, whose specific force is along its z axis however it tilts, and a unit without errors."""
     random, time = np.random.default_rng(1), np.arange(6000) / 100.0
 
@@ -166,9 +166,15 @@ def test_acceleration_that_lasts_is_no_error_of_a_unit(turned):
         magnetic_field=attitude(time).inv().apply([0.0, 20.0, -43.0]) + 0.3 * random.standard_normal(rate.shape),
         magnetic_unit="uT",
     )
-    first = sd.calibrate(flight).remarks[0]
+    wrong = sd.calibrate(flight)
+    first = wrong.remarks[0]
     assert first.startswith("Do not use this calibration: its accelerometer scale y of -3.7 % is that of no unit")
     assert not any("Do not use" in remark for remark in turned[2].remarks)
+    calibration.write(wrong, tmp_path / "calibration.toml")
+    used = sd.estimate(flight, calibration=calibration.read(tmp_path / "calibration.toml"))
+    assert any(
+        remark.startswith("Doubtful calibration: its accelerometer scale y of -3.7 % is") for remark in used.remarks
+    )
 
 
 def test_an_interval_begins_with_the_sample_after_its_edge():

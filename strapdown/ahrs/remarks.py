@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 
 from strapdown.ahrs.estimating import AhrsEstimate
+from strapdown.calibration.calibrating import implausible
 from strapdown.checks import Hint, lengths
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE
@@ -71,12 +72,14 @@ def fixed_frame(recording: Recording) -> str:
 def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
     """Return the remarks on an estimate with the model of a motion."""
     used, delays = result.recording, result.delays
+    doubtful = "" if result.applied is None else implausible(result.applied)
     sentences = [
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s.",
         *used.remarks,
         f"Fixed frame: {fixed_frame(used)}.",
         _model(motion, result),
         misfit(result, motion),
+        doubtful and f"Doubtful calibration: {doubtful}. Calibrate the unit again, or leave the calibration out.",
         *delays.words,
         *(f"{fault}." for fault in result.faults.words),
     ]

@@ -216,11 +216,16 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
         magnetic_unit=recordings[0].magnetic_unit if len(prior.mean) > fitting.IRON.start else "",
         source=", ".join(dict.fromkeys(recording.source for recording in recordings)),
     )
-    return replace(unit, remarks=(*implausible(unit), *missing(unit, strength)))
+    doubt = implausible(unit)
+    refused = (
+        f"Do not use this calibration: {doubt}; acceleration that lasts, as in a flight or a vehicle, was mistaken for it. "
+        "Turn the unit by hand, in one place."
+    )
+    return replace(unit, remarks=((refused,) if doubt else ()) + missing(unit, strength))
 
 
-def implausible(calibration: UnitCalibration) -> tuple[str, ...]:
-    """Return the largest of the errors of gyro and accelerometer that no unit has: acceleration that lasts is mistaken for them."""
+def implausible(calibration: UnitCalibration) -> str:
+    """Return the largest of the errors of gyro and accelerometer that no unit has, in words; empty if there is none."""
     prior = {
         "gyro_matrix": GYRO_SIGMA,
         "accelerometer_bias": FORCE_BIAS_SIGMA,
@@ -229,12 +234,9 @@ def implausible(calibration: UnitCalibration) -> tuple[str, ...]:
     errors = [(name, axes, error) for name, axes, error in calibration.entries() if name in prior]
     name, axes, worst = max(errors, key=lambda entry: abs(entry[2]) / prior[entry[0]])
     if abs(worst) <= PLAUSIBLE * prior[name]:
-        return ()
+        return ""
     words, unit, factor = printed(name, axes, calibration.magnetic_unit)
-    return (
-        f"Do not use this calibration: its {words} of {worst / factor:.2g} {unit} is that of no unit; acceleration that lasts, "
-        "as in a flight or a vehicle, was mistaken for it. Turn the unit by hand, in one place.",
-    )
+    return f"its {words} of {worst / factor:.2g} {unit} is that of no unit"
 
 
 def missing(calibration: UnitCalibration, strength: float = 1.0) -> tuple[str, ...]:
