@@ -1,5 +1,8 @@
 """Arrays of other programs: what is masked, complex or asymmetric is never judged or filtered as if it were plain numbers."""
 
+import dataclasses
+import datetime
+
 import numpy as np
 import pytest
 
@@ -58,6 +61,46 @@ def test_complex_arrays_are_refused_by_name(call, name):
         match=rf"{'time' if name == 'true_time' else name} is not an array of numbers \(it holds complex numbers\)",
     ):
         call(**{name: VALUES[name] + 1e-3j})
+
+
+def test_a_negative_variance_is_refused_by_its_place():
+    wrong = P.copy()
+    wrong[5, 1, 1] = -1e-4
+    for call in (estimate, checked):
+        with pytest.raises(InputError, match=r"covariance\[5, 1, 1\] is -0\.0001, but a variance is not negative"):
+            call(covariance=wrong)
+
+
+def test_an_estimate_without_covariance_has_errors_and_no_verdict():
+    turned = quaternion.multiply(TRUE, quaternion.exp([0.0, 0.0, 0.01]))
+    plain = records.Estimate.from_arrays(TIME, turned)
+    truth = records.Truth(attitude=TRUE)
+    assert sd.accuracy(plain, truth).given["all samples"]["total"].rms == pytest.approx(0.01)
+    assert sd.check(plain, truth).verdict == "cannot tell"
+    with pytest.raises(InputError, match="check_attitudes"):
+        sd.check(plain, recordings.Attitudes.from_arrays(TIME, TRUE))
+
+
+def test_attitudes_are_compared_in_the_clock_of_the_estimate():
+    """Both count from 1970; the time of the estimate begins at its first stamp."""
+    epoch = 1_700_000_000_000_000_000
+    own = records.Estimate.from_arrays(TIME, quaternion.multiply(TRUE, quaternion.exp([0.0, 0.0, 0.01])))
+    own = dataclasses.replace(own, origin=records.Origin(epoch_ns=epoch))
+    compared = sd.accuracy(own, recordings.Attitudes.from_arrays(TIME + epoch / 1e9, TRUE))
+    assert compared.given["all samples"]["total"].rms == pytest.approx(0.01)
+    assert compared.alignment.offset == pytest.approx(0.0, abs=1e-3)
+
+
+def test_dates_as_texts_or_objects_are_stamps():
+    start = datetime.datetime(2026, 3, 29, 0, 59, tzinfo=datetime.UTC)
+    days = [start + datetime.timedelta(seconds=k / 100.0) for k in range(N)]
+    zone = datetime.timezone(datetime.timedelta(hours=2))
+    for stamps in (days, [str(day) for day in days], [day.astimezone(zone).isoformat() for day in days]):
+        walk = sd.read(table() | {"time": np.array(stamps, dtype=object)})
+        assert walk.epoch_ns == round(start.timestamp()) * 10**9
+        np.testing.assert_allclose(walk.time, TIME / 100.0, atol=1e-9)
+    with pytest.raises(InputError, match=r"time\[3\] is not a date"):
+        sd.read(table() | {"time": np.array([*map(str, days[:3]), "soon", *map(str, days[4:])], dtype=object)})
 
 
 MISSING = {

@@ -420,8 +420,10 @@ def test_frames_and_clock_are_found_and_removed(replayed):
         (quaternion.conjugate, "the inverse, fixed"),
         (lambda q: q[:, [1, 2, 3, 0]], "read as scalar last,"),
         (lambda q: quaternion.conjugate(q)[:, [1, 2, 3, 0]], "scalar last and the inverse"),
+        (lambda q: q[:, [3, 0, 1, 2]], "read as scalar first,"),  # as a TUM file with w before x is read
+        (lambda q: quaternion.conjugate(q)[:, [3, 0, 1, 2]], "scalar first and the inverse"),
     ],
-    ids=["conjugate", "last", "last, conjugate"],
+    ids=["conjugate", "last", "last, conjugate", "first", "first, conjugate"],
 )
 def test_conventions_of_quaternions_are_found(replayed, convention, words):
     e, t, every = replayed.estimate, replayed.record.truth, slice(None, None, 3)

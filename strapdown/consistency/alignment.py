@@ -351,4 +351,6 @@ _CONVENTIONS = {
     "the inverse, fixed frame to body": quaternion.conjugate,
     "scalar last": lambda q: q[:, [3, 0, 1, 2]],
     "scalar last and the inverse": lambda q: quaternion.conjugate(q[:, [3, 0, 1, 2]]),
+    "scalar first": lambda q: q[:, [1, 2, 3, 0]],  # in a format whose scalar is last, such as TUM
+    "scalar first and the inverse": lambda q: quaternion.conjugate(q[:, [1, 2, 3, 0]]),
 }

@@ -33,7 +33,7 @@ from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge, 
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.estimation.setup import from_toml, unmodelled
-from strapdown.records import Estimate, Innovations, Origin
+from strapdown.records import Estimate, Origin
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -191,7 +191,7 @@ def check_attitudes(
     aligned = in_truth_frames(common.attitude, alignment)
     frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
     if whole.covariance is None:
-        estimate = without_covariance(common.time, aligned, own.innovations)
+        estimate = Estimate.from_arrays(common.time, aligned, innovations=own.innovations)
     else:
         derivatives = jacobian(common.time, aligned, true)
         readings = _readings(common, alignment, derivatives)
@@ -236,7 +236,7 @@ def _without_truth(own: Attitudes, how: Mapping[str, Any]) -> Checked:
         raise InputError(
             f"{own.source} has no innovations, so it cannot be judged without a truth; give {Hint('truth')}, attitudes over the same time"
         )
-    estimate = without_covariance(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+    estimate = Estimate.from_arrays(own.seconds(int(own.stamps_ns[0])), own.attitude, innovations=own.innovations)
     estimate = replace(estimate, motion=own.motion)
     return Checked(judgement=judge(estimate, **how), estimate=estimate)
 
@@ -283,11 +283,6 @@ def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
         return ()
     names = [part.strip() for part in align.split(",")] if isinstance(align, str) else list(align)
     return tuple(one_of("align", name, (*ALIGNED, "auto", "none")) for name in names)
-
-
-def without_covariance(time: Array, attitude: Array, innovations: Mapping[str, Innovations]) -> Estimate:
-    """Return an estimate without covariances, so that only its innovations can be judged."""
-    return Estimate.from_arrays(time, attitude, np.full((len(time), 3, 3), np.nan), innovations=innovations)
 
 
 # ------------------------------------------------------------------------------------------------------------ readings

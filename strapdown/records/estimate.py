@@ -169,6 +169,12 @@ def matrices(name: str, value: ArrayLike, m: int) -> Array:
     P = numbers(name, value, allow_nan=True)
     if P.shape not in ((m, 3, 3), (m, 6, 6)):
         raise InputError(f"{name} has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time")
+    negative = np.argwhere(np.diagonal(P, axis1=1, axis2=2) < 0.0)
+    if len(negative):
+        k, i = negative[0]
+        raise InputError(
+            f"{name}[{k}, {i}, {i}] is {P[k, i, i]:g}, but a variance is not negative; give the covariance"
+        )
     return symmetric(name, array(name, P, P.shape, allow_nan=True), SINGLE_ROUNDING)
 
 
@@ -315,7 +321,7 @@ class Estimate(ByValue, Listed):
         cls,
         time: ArrayLike,
         attitude: ArrayLike,
-        covariance: ArrayLike,
+        covariance: ArrayLike | None = None,
         *,
         bias: ArrayLike | None = None,
         innovations: Mapping[str, Innovations] | None = None,
@@ -328,9 +334,9 @@ class Estimate(ByValue, Listed):
             Times, s, strictly increasing.
         attitude : array_like (m, 4)
             Unit quaternions q_fb, scalar first. NaN at times without an estimate.
-        covariance : array_like (m, 3, 3) or (m, 6, 6)
+        covariance : array_like (m, 3, 3) or (m, 6, 6), optional
             Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN at
-            times without an estimate.
+            times without an estimate. If not given, the errors can be reported (:func:`strapdown.accuracy`) but not judged.
         bias : array_like (m, 3), optional
             Gyro bias, rad/s, body axes. If not given, bias and its covariance are NaN, and only the attitude is judged.
         innovations : mapping of str to Innovations, optional
@@ -352,7 +358,7 @@ class Estimate(ByValue, Listed):
         q = array("attitude", attitude, (m, 4), allow_nan=True)
         known = are_finite(q)
         unit_quaternions("attitude", q[known])
-        P = matrices("covariance", covariance, m)
+        P = np.full((m, 3, 3), np.nan) if covariance is None else matrices("covariance", covariance, m)
         if bias is not None and P.shape[1] == 3:
             raise InputError("bias is given, but covariance is of the attitude only; give that of (δθ, δb), (m, 6, 6)")
         whole = np.full((m, 6, 6), np.nan)

@@ -163,7 +163,7 @@ def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes 
         return accuracy_of_rows(result, known, align=known is not None and not known.has_bias)
     P = result.attitude_covariance
     own = Series(result.time, result.attitude, P if P is not None and np.isfinite(P).all() else None)
-    return accuracy_of(own, Series(truth.seconds(0), truth.attitude, movement=truth.movement))
+    return accuracy_of(own, Series(truth.seconds(result.epoch_ns), truth.attitude, movement=truth.movement))
 
 
 def _need_same_draw(result: Estimate, record: ImuRecord) -> None:
@@ -182,6 +182,11 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
                 f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, which is matched by time"
             )
         return truth
+    if isinstance(truth, Attitudes):
+        raise InputError(
+            "truth is attitudes of another clock and other frames; give them, and the Attitudes of the estimate, to "
+            "strapdown.consistency.check_attitudes"
+        )
     instance(
         "truth", truth, (ImuRecord, Recording), "give the record, the recording, or a Truth at the estimate's epochs"
     )
