@@ -167,7 +167,7 @@ def test_the_legend_of_one_slice_of_the_likelihood_is_within_its_figure():
     figure = tuning.likelihood_slices(slices, SimpleNamespace(parameters=(parameter,), composite=False))
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
-    assert 0.0 <= box.x0
+    assert box.x0 >= 0.0
     assert box.x1 <= figure.bbox.x1
 
 
