@@ -132,6 +132,19 @@ def test_the_file_of_an_estimate_keeps_the_clock(case, tmp_path):
     assert read_estimate(tmp_path / "walk.h5").origin.epoch_ns == -5_000_000_000
 
 
+@pytest.mark.parametrize("ending", ["csv", "tsv", "parquet"])
+def test_a_table_of_an_estimate_is_read_back(case, tmp_path, ending):
+    pytest.importorskip("pyarrow" if ending == "parquet" else "numpy")
+    estimate, recording = case
+    path = sd.write(estimate, tmp_path / f"walk.{ending}")
+    again = sd.read_attitudes(path)
+    np.testing.assert_array_equal(again.stamps_ns, recording.clock_ns[10:])
+    np.testing.assert_allclose(again.attitude, estimate.attitude, atol=1e-15)
+    np.testing.assert_allclose(again.covariance, estimate.covariance, rtol=1e-12)
+    with pytest.raises(InputError, match="has attitudes and no gyro; read it by `sd"):
+        sd.read(path)
+
+
 def test_a_table_says_all_in_its_names(case):
     estimate, _ = case
     table = estimate.table()

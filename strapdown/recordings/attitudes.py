@@ -4,7 +4,7 @@
 
 - results of this package (HDF5): estimate, simulated record (its truth);
 - the reference of a recording (BROAD, EuRoC folder, Parquet), TUM trajectories (no covariance) and EuRoC's ground truth;
-- CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
+- CSV, TSV and Parquet with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
 - ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
   ``QuaternionStamped``;
 - flight logs of PX4 (ULog): ``estimator_states`` with ``estimator_innovations``, or ``vehicle_attitude``.
@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, are_finite, array, order_remedy
 from strapdown.files import reading
-from strapdown.recordings import delimited, formats, recordfiles, ros, trajectories, ulog
+from strapdown.recordings import columns as naming
+from strapdown.recordings import dataframes, delimited, formats, recordfiles, ros, trajectories, ulog
 from strapdown.records import Innovations, Origin, outputs, result_files
 from strapdown.records.estimate import STATES
 from strapdown.records.recording import TIME_UNITS, whole_ns
@@ -157,7 +158,7 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
             raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
         if format_name == "BROAD" and (kind := reading.kind(file)):
             return _own(file, kind)
-        readers = {"ULog": _ulog, "TUM trajectory": _trajectory, "CSV": _table}
+        readers = {"ULog": _ulog, "TUM trajectory": _trajectory, "CSV": _csv, "Parquet": _parquet}
         return readers.get(format_name, _of_recording)(file)
 
 
@@ -236,15 +237,25 @@ _FACTORS = {"deg": DEGREE, "deg2": DEGREE**2, "deg_per_h": DEGREE_PER_HOUR, "deg
 """Factors to SI of the units in names, unless they are SI."""
 
 
-def _table(path: Path) -> Attitudes:
-    """Read a table of text."""
-    table = delimited.Table(path)
-    places, frame = _places(path.name, table.header)
+def _csv(path: Path) -> Attitudes:
+    return _table(delimited.Table(path))
+
+
+def _parquet(path: Path) -> Attitudes:
+    """Read an estimate, or the reference of a recording."""
+    table = dataframes.parquet_table(path)
+    named = any(re.fullmatch(COLUMNS["q"], name.lower()) for name in table.header)
+    return _table(table) if named else _of_recording(path)
+
+
+def _table(table: naming.Table) -> Attitudes:
+    """Read a table with the columns of :data:`COLUMNS`."""
+    places, frame = _places(table.source, table.header)
     time_place, time_unit = places["time"][""]
     numbers = table.load(sorted({place for group in places.values() for place, _ in group.values()}), time_place)
     stamps = table.clock_ns("")  # dates, or numbers so large that no other unit makes sense
     if stamps is None:
-        stamps = _counted_ns(path.name, numbers[time_place], TIME_UNITS[time_unit.replace("sec", "s") or "s"])
+        stamps = _counted_ns(table.source, numbers[time_place], TIME_UNITS[time_unit.replace("sec", "s") or "s"])
     columns = {
         name: {key: numbers[place] * _FACTORS.get(unit, 1.0) for key, (place, unit) in group.items()}
         for name, group in places.items()
@@ -252,7 +263,7 @@ def _table(path: Path) -> Attitudes:
     q = np.stack([columns["q"][axis] for axis in "wxyz"], axis=1)
     rows = np.flatnonzero(are_finite(q))  # the others are not read
     columns = {name: {key: values[rows] for key, values in group.items()} for name, group in columns.items()}
-    covariance, angles, remarks = _covariance(path.name, columns, rows)
+    covariance, angles, remarks = _covariance(table.source, columns, rows)
     bias = None
     if set(columns["bias"]) == set("xyz"):
         bias = np.stack([columns["bias"][axis] for axis in "xyz"], axis=1)
@@ -264,11 +275,11 @@ def _table(path: Path) -> Attitudes:
     if back.any():
         k = int(np.argmax(back)) + 1
         remedy = order_remedy(stamps[rows], k, row := int(rows[k]) + 1)
-        raise InputError(f"{path.name}: row {row} is not after the one before; {remedy}")
+        raise InputError(f"{table.source}: row {row} is not after the one before; {remedy}")
     return Attitudes(
-        source=path.name,
+        source=table.source,
         stamps_ns=stamps[rows],
-        attitude=trajectories.unit_quaternions(path.name, q[rows]),
+        attitude=trajectories.unit_quaternions(table.source, q[rows]),
         covariance=covariance,
         error_frame=angles or frame,
         bias=bias,

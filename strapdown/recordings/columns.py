@@ -17,7 +17,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,35 +118,43 @@ def unit_of(group: str, text: str) -> str:
     return spelled or ("" if group == "magnetometer" else small.get(squeezed, ""))
 
 
+class Table(Protocol):
+    """A table in a file or in memory, of which only the requested columns are read; the others may have any content."""
+
+    source: str
+    header: list[str]
+
+    def load(self, places: Sequence[int], time: int) -> Mapping[int, Array]:
+        """Return the numbers (n,) of columns, empty fields NaN, from their indices and that of the time."""
+
+    def clock_ns(self, unit: str) -> NDArray[np.int64] | None:
+        """Return the loaded stamps, of a unit, "" if unknown, if they are dates, or integers that count ns from 1970; else None."""
+
+
 def recording(
-    source: str,
-    names: Sequence[str],
-    load: Callable[[Sequence[int], int], Mapping[int, Array]],
-    clock_ns: Callable[[int, str], NDArray[np.int64] | None],
+    table: Table,
     *,
     units: Mapping[str, str] | None = None,
     columns: Mapping[str, str] | None = None,
 ) -> Recording:
-    """Return the recording of a table with these names of columns.
+    """Return the recording of a table.
 
-    ``load`` returns the numbers (n,) of columns, empty fields NaN, from their indices and that of the time, and is called once.
-    ``clock_ns`` returns the stamps of a loaded column, of the unit that is declared, if it has dates or integers that count ns from 1970;
-    otherwise None. ``units`` are used if the header declares none. ``columns`` gives columns by role, optionally with a unit,
+    ``units`` are used if the header declares none. ``columns`` gives columns by role, optionally with a unit,
     ``{"gx": "gyro_x [dps]"}``; the others are found by their names.
     """
-    units, columns = units or {}, columns or {}
+    source, units, columns = table.source, units or {}, columns or {}
     for name, value in (("units", units), ("columns", columns)):
         instance(name, value, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units, [group for group in UNITS if group != "temperature"])
-    header = [column(cell) for cell in names]
+    header = [column(cell) for cell in table.header]
     counts = Counter(column.name.lower() for column in header if column.name)
     if twice := [name for name, number in counts.items() if number > 1]:
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     roles, declared, remark = _roles(source, header, columns)
     _need_whole_groups(source, header, roles)
     unit_of_group = _units(source, {_group(role) for role in roles}, declared, units)
-    values = load(sorted(set(roles.values())), roles["time"]).__getitem__
-    stamps = clock_ns(roles["time"], declared.get("time", ""))
+    values = table.load(sorted(set(roles.values())), roles["time"]).__getitem__
+    stamps = table.clock_ns(declared.get("time", ""))
     if stamps is None:
         time, epoch = _seconds(values(roles["time"]), TIME_UNITS[unit_of_group["time"]])
     else:
@@ -172,6 +180,10 @@ def _need_whole_groups(source: str, header: Sequence[Column], roles: Mapping[str
         )
     for group, members in GROUPS.items():
         missing = [role for role in members if role not in roles]
+        if group == "gyro" and missing and {"qw", "qx", "qy", "qz"} <= {column.name.lower() for column in header}:
+            raise InputError(
+                f"{source} has attitudes and no gyro; read it by `sd.read_attitudes`, or `strapdown check --truth`"
+            )
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
             raise InputError(
                 f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in header)}); "

@@ -7,7 +7,7 @@ they are converted to ns since 1970, UTC. Missing values are missing samples. Ax
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,31 +34,43 @@ def from_table(
 
     ``source`` is its name in messages; options as for :func:`strapdown.read`.
     """
-    held = {name: _dates(column) for name, column in _columns(source, table).items()}
-    names, arrays = list(held), list(held.values())
-    for name, column in held.items():
-        if np.shape(column) != np.shape(arrays[0]) or np.ndim(column) != 1:
-            raise InputError(
-                f"{source}: column {name} has shape {np.shape(column)}, the first {np.shape(arrays[0])}; give arrays (n,) or "
-                "(n, 3) of one length"
-            )
+    return naming.recording(ArrayTable(source, _columns(source, table)), units=units, columns=columns)
 
-    def values(k: int, time: int) -> Array:
-        x = arrays[k]
-        converted = x.astype(np.float64) if x.dtype.kind == "b" or (k == time and x.dtype.kind in "mM") else x
-        return numbers(f"{source}: column {names[k]}", converted, allow_nan=True)
 
-    def clock_ns(k: int, unit: str) -> NDArray[np.int64] | None:
-        x = arrays[k]
+class ArrayTable:
+    """A table in memory."""
+
+    def __init__(self, source: str, columns: Mapping[str, NDArray[np.generic]]) -> None:
+        self.source, self.header = source, list(columns)
+        self._arrays = [_dates(column) for column in columns.values()]
+        self._time = 0
+        for name, column in zip(self.header, self._arrays, strict=True):
+            if np.shape(column) != np.shape(self._arrays[0]) or np.ndim(column) != 1:
+                raise InputError(
+                    f"{source}: column {name} has shape {np.shape(column)}, the first {np.shape(self._arrays[0])}; give arrays (n,) or "
+                    "(n, 3) of one length"
+                )
+
+    def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
+        """Return the numbers (n,) of columns, from their indices and that of the time."""
+        self._time = time
+        return {k: self._numbers(k) for k in places}
+
+    def _numbers(self, k: int) -> Array:
+        x = self._arrays[k]
+        converted = x.astype(np.float64) if x.dtype.kind == "b" or (k == self._time and x.dtype.kind in "mM") else x
+        return numbers(f"{self.source}: column {self.header[k]}", converted, allow_nan=True)
+
+    def clock_ns(self, unit: str) -> NDArray[np.int64] | None:
+        """Return the loaded stamps, of a unit, "" if unknown, if they are dates, or integers that count ns from 1970; else None."""
+        x = self._arrays[self._time]
         if x.dtype.kind in "mM":
             if np.isnat(x).any():
-                raise InputError(f"{source}: {names[k]}[{int(np.argmax(np.isnat(x)))}] is not a date; drop such rows")
+                row = int(np.argmax(np.isnat(x)))
+                raise InputError(f"{self.source}: {self.header[self._time]}[{row}] is not a date; drop such rows")
             return x.astype(f"{x.dtype.kind}8[ns]").astype(np.int64)
         large = x.dtype.kind in "iu" and unit in ("", "ns") and len(x) and abs(int(x[0])) > CLOCK_OFFSET * 1e9
         return x.astype(np.int64) if large else None
-
-    load = lambda places, time: {k: values(k, time) for k in places}  # noqa: E731
-    return naming.recording(source, names, load, clock_ns, units=units, columns=columns)
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
@@ -143,15 +155,20 @@ def read_parquet(
     columns: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
+    return naming.recording(parquet_table(file), units=units, columns=columns)
+
+
+def parquet_table(file: Path) -> ArrayTable:
+    """Return the numbers, flags and dates of a Parquet file."""
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     types = library("pyarrow.types", "Parquet")
     with parquet.ParquetFile(file, page_checksum_verification=True) as content:
         schema, rows = content.schema_arrow, content.metadata.num_rows
-        # Numbers, flags and dates; other columns, which may have any size, are not read.
+        # Other columns, which may have any size, are not read.
         flat = [k for k, column in enumerate(schema) if types.is_primitive(column.type) or types.is_null(column.type)]
         reading.need_room(file, 8.0 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
-    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns)
+    return ArrayTable(file.name, _of_arrow(table))
 
 
 def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:

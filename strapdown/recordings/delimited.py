@@ -42,12 +42,10 @@ def read_csv(
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
-    left out and listed in ``missing_gyro``, their other samples moved to the nearest row; rows that repeat the row before are left out and
-    listed in ``repeated``. Options as for :func:`strapdown.read`.
+    left out and listed in ``missing_gyro``, their other samples moved to the nearest row; rows with the stamp of the row before are left
+    out and listed in ``repeated``. Options as for :func:`strapdown.read`.
     """
-    table = Table(file)
-    clock_ns = lambda _, unit: table.clock_ns(unit)  # noqa: E731
-    return naming.recording(file.name, table.header, table.load, clock_ns, units=units, columns=columns)
+    return naming.recording(Table(file), units=units, columns=columns)
 
 
 class Table:
