@@ -390,6 +390,28 @@ def test_euler_axes_are_the_derivative_of_the_angles():
 F, B = quaternion.exp(np.array([0.1, 0.2, 2.0])), quaternion.exp(np.array([1.5, 0.3, -0.7]))
 
 
+def test_usual_frames_are_named():
+    """Attitudes as ahrs, NED libraries and forward-right-down units give them, by the directions of their axes."""
+    angles = np.stack(
+        [np.linspace(0.0, 6.0, 300), 0.5 * np.sin(np.arange(300) / 20.0), np.cos(np.arange(300) / 15.0)], 1
+    )
+    truth = Rotation.from_euler("ZYX", angles)  # forward-left-up to East-North-Up
+    ned = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # East is (0, 1, 0) in North-East-Down
+    nwu = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # East is (0, −1, 0) in North-West-Up
+    frd = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    for own, words in (
+        (ned * truth, ["North-East-Down and East-North-Up"]),
+        (nwu * truth, ["North-West-Up and East-North-Up"]),
+        (ned * truth * frd, ["North-East-Down and East-North-Up", "forward-right-down and forward-left-up"]),
+        (Rotation.from_euler("z", 1.0) * truth, []),
+    ):
+        both = (
+            recordings.Attitudes.from_arrays(np.arange(300) / 10.0, quaternion.from_rotation(q)) for q in (own, truth)
+        )
+        remarks = " ".join(consistency.check_attitudes(*both).remarks)
+        assert re.findall(r"an axis, as ([\w-]+ and [\w-]+) do", remarks) == words
+
+
 def test_frames_and_clock_are_found_and_removed(replayed):
     e = replayed.estimate
     turned = quaternion.multiply(quaternion.multiply(F, e.attitude), B)

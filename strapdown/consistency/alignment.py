@@ -20,6 +20,15 @@ from strapdown.units import DEGREE
 
 ALIGNED = ("time", "fixed", "body")
 """Parts of an alignment: clocks, fixed frames, body frames."""
+USUAL_FRAMES = {
+    "fixed": {
+        "North-East-Down and East-North-Up": (np.pi / np.sqrt(2.0), np.pi / np.sqrt(2.0), 0.0),
+        "North-West-Up and East-North-Up": (0.0, 0.0, np.pi / 2.0),
+        "East-North-Up and North-West-Up": (0.0, 0.0, -np.pi / 2.0),
+    },
+    "body": {"forward-right-down and forward-left-up": (np.pi, 0.0, 0.0)},
+}
+"""Rotation vectors between usual frames, rad, that of the estimate first."""
 GROSS = 5.0 * DEGREE
 """A constant rotation above this is a difference of frames and not an error of a filter, rad."""
 LONGEST_OFFSET = 30.0
@@ -81,9 +90,17 @@ class Alignment:
                 sigma = float(np.sqrt(np.mean(self.sigma[rows] ** 2))) / DEGREE
                 words.append(
                     f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
-                    "axis: removed; a constant error of the filter would look the same"
+                    f"axis{_usual(name, rotation)}: removed; a constant error of the filter would look the same"
                 )
         return tuple(words)
+
+
+def _usual(name: str, rotation: Array) -> str:
+    """Return the usual frames that differ by nearly this rotation vector, rad, in words; empty if there are none."""
+    for words, usual in USUAL_FRAMES[name].items():
+        if quaternion.angle_between(quaternion.exp(rotation), quaternion.exp(usual)) < GROSS:
+            return f", as {words} do"
+    return ""
 
 
 @dataclass(frozen=True, eq=False)
