@@ -29,7 +29,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     if toml.exists():
         making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
     making += [
-        page.paragraph("To use it:"),
+        page.paragraph("To use it with a record; the estimate of a recording takes no filter:"),
         page.code(f'estimate = sd.estimate(record, setup=sd.estimation.setup.read_setup("{toml.name}"))'),
     ]
     number = len(content["records"])
