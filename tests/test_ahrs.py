@@ -826,6 +826,17 @@ def test_a_long_delay_of_the_magnetometer_is_found_and_compensated(behind):
     assert used[-1] == pytest.approx(behind, abs=1e-3)
 
 
+@pytest.mark.parametrize("behind", [0.0, 0.011, 0.2])
+@pytest.mark.parametrize("every", [3, 5])
+def test_the_delay_of_a_magnetometer_slower_than_the_gyro_is_found(behind, every):
+    shown = late(field=behind)
+    field = np.full_like(shown.magnetic_field, np.nan)
+    field[1::every] = shown.magnetic_field[1::every]
+    delay, sigma = sensor_delays.magnetometer_delay(dataclasses.replace(shown, magnetic_field=field))
+    assert sigma < 1e-3
+    assert delay == pytest.approx(behind, abs=2e-3)
+
+
 def test_a_long_delay_that_the_motion_does_not_refine_is_reported_with_its_sigma():
     found = sensor_delays.find(late(field=0.2, bias=(10.0, -6.0, 8.0)))
     assert found.last_field == pytest.approx(0.2, abs=2.0 * found.field_sigma + 5e-3)

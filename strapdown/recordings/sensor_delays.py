@@ -14,7 +14,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, median, non_negative
 from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import Recording
+from strapdown.records.recording import Recording, sampled
 
 FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
@@ -24,6 +24,8 @@ LONGEST_DELAY = 0.5
 """Maximum delay of the magnetometer that is looked for, s."""
 SEARCHED_PAIRS = 300
 """Number of pairs of field samples in the search for a long delay."""
+SHORT_DELAY = 0.05
+"""Delay up to which the linear fit finds it, s."""
 LONG_MISFIT = 0.5
 """Mean square change of the field at a long delay, relative to that at a short one, below which the delay is long. In 91 public recordings,
 none of which has one, it is 1; with a delay of 0.2 s added it is mostly below 0.3."""
@@ -147,18 +149,23 @@ def _evidence(recording: Recording, turned: Array) -> tuple[float, tuple[Array, 
 
     That is times (m,), s, of pairs of field samples, and the products c·w, w·w, c·c of their change c and that by a unit delay, w.
     """
+    field = recording.magnetic_field
+    assert field is not None
+    known = sampled(field)
+    if np.sum(known) < 2:
+        return 0.0, (np.empty(0),) * 4
+    if 2 * np.sum(known) < len(known):  # of a slow sensor, no two samples may be a span of the gyro's rows apart
+        recording, turned, field = recording.taken(known), turned[known], field[known]
     time = recording.time
-    assert recording.magnetic_field is not None
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
     if len(time) < 10 * lag:
         return 0.0, (np.empty(0),) * 4
     stride = max(1, lag // PAIRS_IN_SPAN)
     lag = max(1, lag // stride)
     shift = stride * _long_shift(recording, turned, stride, lag)
-    field = _shifted(recording.magnetic_field, shift)
     at = time[::stride]
     still, late, products = np.empty((len(at), 3)), np.empty((len(at), 3)), np.empty((len(at) - lag, 3))
-    arrays = (read_only(column) for column in (recording.rate, field, turned))
+    arrays = (read_only(column) for column in (recording.rate, _shifted(field, shift), turned))
     compiled(recording_samples.field_changes)(*arrays, stride, lag, still, late, products)
     pairs = np.isfinite(products[:, 1])
     return shift * recording.interval, (at[lag:][pairs], *products[pairs].T.copy())
@@ -170,7 +177,7 @@ def _long_shift(recording: Recording, turned: Array, stride: int, lag: int) -> i
     assert field is not None
     begin, end = stride * longest, len(field) - stride * (longest + lag)
     rows = np.linspace(begin, end, SEARCHED_PAIRS, endpoint=False, dtype=int) if begin < end else np.empty(0, int)
-    if longest < 2 or len(rows) == 0:
+    if longest < 1 or len(rows) == 0:
         return 0
     shifts = np.arange(-longest, longest + 1)
     first, last = (
@@ -182,7 +189,7 @@ def _long_shift(recording: Recording, turned: Array, stride: int, lag: int) -> i
     if not known.any():
         return 0
     misfit = square[known].mean(axis=0)
-    is_short = np.abs(shifts) < 2
+    is_short = stride * recording.interval * np.abs(shifts) < SHORT_DELAY
     return int(shifts[np.argmin(misfit)]) if misfit.min() < LONG_MISFIT * misfit[is_short].min() else 0
 
 
