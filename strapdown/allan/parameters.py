@@ -177,11 +177,6 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
     -------
     str
         Content of the file.
-
-    Raises
-    ------
-    InputError
-        If a sensor or a term is missing.
     """
     _both(fits, "Kalibr")
     checks.positive("factor", factor)
@@ -216,11 +211,6 @@ def to_px4(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     -------
     str
         Content of the file.
-
-    Raises
-    ------
-    InputError
-        If a sensor or a term is missing.
     """
     _both(fits, "PX4")
     root = math.sqrt(PX4_STEP)

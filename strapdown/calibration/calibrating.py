@@ -69,11 +69,6 @@ def calibrate(
         Errors with σ, for :func:`strapdown.estimate` and :func:`strapdown.calibration.write`; its ``remarks`` name the motion that is
         missing for the errors whose σ is large.
 
-    Raises
-    ------
-    InputError
-        If there is no recording, a recording has no accelerometer, all are too short, or the units of their fields differ.
-
     References
     ----------
     D. Tedaldi, A. Pretto, E. Menegatti, A robust and easy to implement method for IMU calibration without external equipments, ICRA 2014.

@@ -71,7 +71,6 @@ class SensorErrors(ByValue):
     magnetometer_delay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field."""
         for name in FORM:
             value = getattr(self, name)
             if name.endswith("delay"):
@@ -275,11 +274,6 @@ def read(path: str | os.PathLike[str]) -> UnitCalibration:
     -------
     UnitCalibration
         The calibration.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not TOML, has no such table, or has another key or shape.
     """
     return tables.read(path, "calibration", "`strapdown calibrate` writes one", _from_table)
 

@@ -75,7 +75,6 @@ class Algorithm:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Check sizes, solver and products."""
         checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
         for what, minimum in (("samples", 1), ("order", 1), ("previous", 0), ("following", 0)):
             checks.count(f"{self.name}: {what}", getattr(self, what), minimum=minimum)

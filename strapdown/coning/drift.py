@@ -79,7 +79,6 @@ class VibrationLine:
     """Phase lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift."""
 
     def __post_init__(self) -> None:
-        """Check the fields."""
         checks.positive("frequency", self.frequency, unit="Hz")
         checks.non_negative("angle", self.angle, unit="rad")
         if self.angle_across is not None:

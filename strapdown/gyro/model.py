@@ -119,7 +119,6 @@ class GyroSpec(ByValue):
     drop_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field."""
         fields: dict[str, Any] = {name: _by_axis(name, getattr(self, name), unit) for name, unit in _BY_AXIS.items()}
         ramp: Any = self.rate_ramp
         fields["rate_ramp"] = (

@@ -38,7 +38,6 @@ class CircularOrbit:
     phase: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check every field."""
         positive("altitude", self.altitude, unit="m")
         finite("inclination", self.inclination, unit="rad")
         finite("phase", self.phase, unit="rad")

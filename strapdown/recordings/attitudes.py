@@ -138,11 +138,6 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
     Attitudes
         Time stamps, q_fb, and covariance, bias and innovations if the file has them.
 
-    Raises
-    ------
-    InputError
-        If the file has no attitudes, cannot be read, or several topics of a bag have attitudes.
-
     Examples
     --------
     >>> import strapdown as sd

@@ -134,7 +134,6 @@ class ImuRecord(ByValue, Listed):
     temperature: Array | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes, order and finiteness."""
         time = increasing("time", self.time, minimum=2)
         if self.temperature is not None:
             object.__setattr__(self, "temperature", array("temperature", self.temperature, (len(time),)))

@@ -103,7 +103,6 @@ class Recording(Listed):
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check shapes, order and values."""
         time = increasing(f"{self.source}: time", self.time, minimum=2)
         n = len(time)
         if time[-1] - time[0] > LONGEST_GAP and np.max(np.diff(time)) > LONGEST_GAP:

@@ -39,7 +39,6 @@ class Temperature:
     time_constant: float = np.inf
 
     def __post_init__(self) -> None:
-        """Check all."""
         finite("start", self.start, unit="°C")
         finite("end", self.end, unit="°C")
         if self.time_constant != np.inf:
@@ -108,7 +107,6 @@ class Scenario(ByValue):
     temperature: Temperature | None = None
 
     def __post_init__(self) -> None:
-        """Check rate, duration, motion, gyro, and the names of the sensors."""
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
         if self.duration * self.rate > MAX_SAMPLES:

@@ -95,7 +95,6 @@ class Accelerometer(Sampled):
     kind: Kind = "direction"
 
     def __post_init__(self) -> None:
-        """Check every field."""
         self._check_sampling(self.sigma, "m/s²")
         one_of(f"{self.name}: kind", self.kind, ("direction", "vector"))
         for name in ("lever_arm_b", "bias", "gravity_f"):

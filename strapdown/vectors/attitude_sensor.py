@@ -43,7 +43,6 @@ class AttitudeSensor(Sampled):
     boresight: str | tuple[float, ...] = "z"
 
     def __post_init__(self) -> None:
-        """Check every field."""
         self._check_sampling(self.sigma_across, "rad")
         non_negative(f"{self.name}: sigma_about", self.sigma_about, unit="rad")
         object.__setattr__(self, "boresight", _boresight(f"{self.name}: boresight", self.boresight))

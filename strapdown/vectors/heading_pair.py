@@ -33,7 +33,6 @@ class HeadingPair(Sampled):
     sigma: float
 
     def __post_init__(self) -> None:
-        """Check every field."""
         self._check_sampling(self.sigma, "m")
         object.__setattr__(self, "baseline_b", array(f"{self.name}: baseline_b", self.baseline_b, (3,)))
         direction(f"{self.name}: baseline_b", self.baseline_b)

@@ -32,7 +32,6 @@ class HorizonSensor(Sampled):
     sigma: float
 
     def __post_init__(self) -> None:
-        """Check every field."""
         from strapdown.motion.orbit import CircularOrbit  # imports all motions, which recordings do not need
 
         self._check_sampling(self.sigma, "rad")

@@ -41,7 +41,6 @@ class Magnetometer(Sampled):
     kind: Kind = "direction"
 
     def __post_init__(self) -> None:
-        """Check every field."""
         self._check_sampling(self.sigma, "T")
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
         if not callable(self.field_f):

@@ -70,7 +70,6 @@ class VectorMeasurements(ByValue):
     arrival: Array | None = None
 
     def __post_init__(self) -> None:
-        """Check every field."""
         instance("sensor", self.sensor, str, "give the series the name of its sensor")
         one_of(f"{self.sensor}: kind", self.kind, KINDS)
         time = increasing(f"{self.sensor}: time", self.time, minimum=0)

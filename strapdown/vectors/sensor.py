@@ -80,7 +80,6 @@ class Faults:
     duty_share: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check every field."""
         non_negative("latency", self.latency, unit="s")
         windows = tuple(
             (finite("outages: from", a, unit="s"), finite("outages: to", b, unit="s")) for a, b in self.outages

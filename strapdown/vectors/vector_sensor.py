@@ -55,7 +55,6 @@ class VectorSensor(Sampled):
     kind: Kind = "direction"
 
     def __post_init__(self) -> None:
-        """Check every field."""
         object.__setattr__(self, "reference_f", direction(f"{self.name}: reference_f", self.reference_f))
         self._check_sampling(self.sigma, "rad")
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))

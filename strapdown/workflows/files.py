@@ -61,11 +61,6 @@ def read(
     ImuRecord, Estimate, Campaign or Recording
         A record has its ``origin``; the ``remarks`` of a recording list the choices of the reader.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, of unknown format, or does not declare a required unit; or if an option does not apply to it.
-
     Examples
     --------
     >>> import strapdown as sd
