@@ -14,14 +14,7 @@ from importlib import import_module
 from typing import Any
 
 from strapdown.allan.deviation import TERMS, AllanDeviation, allan_deviation, flicker_variance, model_deviation
-from strapdown.allan.noise_fit import (
-    UNITS,
-    NoiseFit,
-    curves_by_axis,
-    fit_noise,
-    to_gyro_parameters,
-    upper_bounds,
-)
+from strapdown.allan.noise_fit import UNITS, NoiseFit, curves_by_axis, fit_noise, to_gyro_parameters, upper_bounds
 from strapdown.allan.power_laws import NOISE_TYPES, equivalent_degrees_of_freedom
 
 __all__ = ["AllanDeviation", "NoiseFit", "allan_deviation", "fit_noise", "to_gyro_parameters"]

@@ -26,12 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks, recordings
-from strapdown.allan.power_laws import (
-    MANY_BLOCKS,
-    NOISE_TYPES,
-    equivalent_degrees_of_freedom,
-    power_law,
-)
+from strapdown.allan.power_laws import MANY_BLOCKS, NOISE_TYPES, equivalent_degrees_of_freedom, power_law
 from strapdown.allan.spectrum import flicker_covariance, inner
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_squares
@@ -92,14 +87,7 @@ class AllanDeviation(Listed):
         wanted = np.geomspace(self.taus[0], self.taus[-1], 2 + round(2.0 * math.log10(self.taus[-1] / self.taus[0])))
         places = np.unique([int(np.argmin(np.abs(np.log(self.taus / tau)))) for tau in wanted])
         axes = "xyz"[: len(self.deviation)]
-        rows = [
-            (
-                self.taus[i],
-                *(axis[i] for axis in self.deviation),
-                float(np.min(self.edf[:, i])),
-            )
-            for i in places
-        ]
+        rows = [(self.taus[i], *(axis[i] for axis in self.deviation), float(np.min(self.edf[:, i]))) for i in places]
         title = f"Allan deviation, {self.samples} samples of {self.sample_interval:.6g} s, SI"
         return Table(title, ("τ, s", *axes, Column("degrees of freedom", digits=3)), rows, left=0)
 

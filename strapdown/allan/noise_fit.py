@@ -27,15 +27,7 @@ from numpy.typing import NDArray
 from strapdown import checks, gyro, units
 from strapdown.allan.deviation import TERMS, AllanDeviation, Source, averaged, confidence, model_deviation
 from strapdown.allan.misfit import worst_misfit
-from strapdown.allan.spectrum import (
-    Bins,
-    Segment,
-    binned,
-    cosine_transform,
-    last_coefficient,
-    scored,
-    segment,
-)
+from strapdown.allan.spectrum import Bins, Segment, binned, cosine_transform, last_coefficient, scored, segment
 from strapdown.checks import Array, InputError
 from strapdown.files import plain
 from strapdown.results import Column, Listed, Table, figure

@@ -45,11 +45,7 @@ WANTED = {
 """Largest σ of each field of a good calibration; the hard iron's relative to the field."""
 
 
-def calibrate(
-    recordings: Recording | Sequence[Recording],
-    *,
-    gravity: float = STANDARD_GRAVITY,
-) -> UnitCalibration:
+def calibrate(recordings: Recording | Sequence[Recording], *, gravity: float = STANDARD_GRAVITY) -> UnitCalibration:
     """Estimate the errors of a unit's sensors, each with its σ, from recordings of motion by hand.
 
     The unit is turned about all its axes for a minute or more, best with pauses of a few seconds in different positions. Estimated are
@@ -94,7 +90,7 @@ def calibrate(
     bias = _resting_bias(intervals)
     strength, intervals, prior = _priors(intervals, bias)
     attitude = _initial_attitude(intervals, prior.mean, bias)
-    nodes = np.zeros((len(intervals.time), 12 if intervals.field is not None else 9))
+    nodes = np.zeros((len(intervals.node_rate), 12 if intervals.field is not None else 9))
     nodes[:, fitting.GYRO_BIAS - 3 : fitting.GYRO_BIAS] = bias
     problem = Problem(intervals, prior, positive("gravity", gravity, unit="m/s²"))
     fit = fitting.solve(problem, Unknowns(prior.mean.copy(), attitude, nodes))
@@ -103,7 +99,7 @@ def calibrate(
 
 def _resting_bias(intervals: Intervals) -> Array:
     """Return the mean rate of the quietest second of each part, at its nodes (n, 3); 0 for a part without rest."""
-    bias = np.zeros((len(intervals.time), 3))
+    bias = np.zeros((len(intervals.node_rate), 3))
     for nodes in np.split(np.arange(len(bias)), intervals.first[1:]):
         inside = np.isin(intervals.node, nodes)
         length = intervals.length[inside][:, None]
@@ -119,7 +115,7 @@ def _resting_bias(intervals: Intervals) -> Array:
 
 def _gyro_frames(intervals: Intervals, turn: Array) -> Array:
     """Return the attitude by the gyro only at every node (n, 3, 3), identity at the start of each part."""
-    frames = np.tile(np.eye(3), (len(intervals.time), 1, 1))
+    frames = np.tile(np.eye(3), (len(intervals.node_rate), 1, 1))
     for k, node in enumerate(intervals.node):
         frames[node + 1] = frames[node] @ turn[k]
     return frames
@@ -221,11 +217,7 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
 
 def implausible(calibration: UnitCalibration) -> str:
     """Return the largest of the errors of gyro and accelerometer that no unit has, in words; empty if there is none."""
-    prior = {
-        "gyro_matrix": GYRO_SIGMA,
-        "accelerometer_bias": FORCE_BIAS_SIGMA,
-        "accelerometer_matrix": FORCE_SIGMA,
-    }
+    prior = {"gyro_matrix": GYRO_SIGMA, "accelerometer_bias": FORCE_BIAS_SIGMA, "accelerometer_matrix": FORCE_SIGMA}
     errors = [(name, axes, error) for name, axes, error in calibration.entries() if name in prior]
     name, axes, worst = max(errors, key=lambda entry: abs(entry[2]) / prior[entry[0]])
     if abs(worst) <= PLAUSIBLE * prior[name]:

@@ -61,16 +61,8 @@ SYMMETRIC = np.zeros((9, 6))
 for _k, (_i, _j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
     SYMMETRIC[3 * _i + _j, _k] = SYMMETRIC[3 * _j + _i, _k] = 1.0
 
-GYRO, BIAS, FORCE, FORCE_DELAY, IRON, FIELD, FIELD_DELAY, DIP = (
-    slice(0, 9),
-    slice(9, 12),
-    slice(12, 18),
-    slice(18, 19),
-    slice(19, 22),
-    slice(22, 31),
-    slice(31, 32),
-    slice(32, 33),
-)
+_ENDS = np.cumsum([0, 9, 3, 6, 1, 3, 9, 1, 1]).tolist()
+GYRO, BIAS, FORCE, FORCE_DELAY, IRON, FIELD, FIELD_DELAY, DIP = map(slice, _ENDS[:-1], _ENDS[1:])
 """Places of the sensor errors in the vector of unknowns: gyro matrix; accelerometer bias, matrix, delay; hard iron, magnetometer matrix,
 delay; dip of the field."""
 ATTITUDE, VELOCITY, LEVER, GYRO_BIAS, DISTURBANCE = (3 * k for k in range(5))
@@ -110,8 +102,6 @@ class Fit(NamedTuple):
     unknowns: Unknowns
     covariance: Array
     """Covariance of the sensor errors, followed by the gyro bias at the last node."""
-    noise: dict[str, float]
-    """Noise of each kind of equation."""
 
 
 def unpacked(x: Array) -> Errors:
@@ -196,7 +186,7 @@ class Problem:
     def __init__(self, intervals: Intervals, prior: Prior, gravity: float) -> None:
         self.intervals, self.prior, self.gravity = intervals, prior, gravity
         self.size = 15 if intervals.field is not None else 12
-        nodes = len(intervals.time)
+        nodes = len(intervals.node_rate)
         self.here, self.there = self.size * intervals.node, self.size * (intervals.node + 1)
         self.errors_at = self.size * nodes
         self._last: tuple[Unknowns, Prediction] | None = None
@@ -371,7 +361,7 @@ def solve(problem: Problem, x: Unknowns) -> Fit:
     wanted = np.concatenate([problem.errors_at + np.arange(len(x.errors)), bias])
     unit = np.zeros((equations.columns, len(wanted)))
     unit[wanted, np.arange(len(wanted))] = 1.0
-    return Fit(x, factor.solve(unit)[wanted], noise)
+    return Fit(x, factor.solve(unit)[wanted])
 
 
 def _iterated(problem: Problem, x: Unknowns, weak: Array, *, noise: bool) -> Unknowns:

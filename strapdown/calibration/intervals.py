@@ -58,8 +58,6 @@ class Intervals(NamedTuple):
     """Node at the start of each interval; the next node is at its end (k,)."""
     node_rate: Array
     """Measured rate at the nodes, rad/s (n, 3)."""
-    time: Array
-    """Time at the nodes, s, of their recording (n,)."""
 
     @property
     def length(self) -> Array:
@@ -106,7 +104,6 @@ def gathered(recordings: Sequence[Recording]) -> Intervals:
         gyro_noise=float(np.median([white_noise(part.rate) for part in parts]) * np.sqrt(interval)),
         node=np.concatenate([b + np.arange(len(edge) - 1) for b, edge in zip(begin, edges, strict=True)]),
         node_rate=np.concatenate([part.rate[edge] for part, edge in zip(parts, edges, strict=True)]),
-        time=np.concatenate([part.time[edge] for part, edge in zip(parts, edges, strict=True)]),
     )
 
 

@@ -80,12 +80,7 @@ def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
     return replace(
         program,
         sensors=tuple(replace(sensor, noise=()) for sensor in program.sensors),
-        recording=Recording(
-            parameters=live.parameters,
-            imu=imu,
-            field=field,
-            rest=rest,
-        ),
+        recording=Recording(parameters=live.parameters, imu=imu, field=field, rest=rest),
     )
 
 

@@ -42,6 +42,21 @@ def compressed_coefficients(samples: int, previous: int = 0) -> Rationals:
     return tuple(k[1:m])
 
 
+def lagrange(last: int) -> list[list[int]]:
+    """Return ``last``! times the coefficients, from t⁰ on, of the Lagrange polynomial of each of the nodes 0, 1, … ``last``."""
+    nodal = [1]
+    for node in range(last + 1):
+        nodal = [low - node * high for low, high in zip([0, *nodal], [*nodal, 0], strict=True)]
+    polynomials = []
+    for node in range(last + 1):
+        quotient = [0] * (last + 1)
+        for power in range(last, -1, -1):  # synthetic division by (t − node)
+            quotient[power] = nodal[power + 1] + (node * quotient[power + 1] if power < last else 0)
+        factor = (-1) ** (last - node) * math.comb(last, node)
+        polynomials.append([factor * c for c in quotient])
+    return polynomials
+
+
 @functools.cache
 def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
     """Return, for each increment of the window, M! times the coefficients of t⁰ … t^{M−1} of its contribution to the rate polynomial.
@@ -49,18 +64,9 @@ def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
     The polynomial of degree M − 1 whose integrals over the M sample intervals are the increments is the derivative of the Lagrange
     interpolant of the summed angle at 0, 1, … M.
     """
-    nodal = [1]
-    for node in range(window + 1):
-        nodal = [low - node * high for low, high in zip([0, *nodal], [*nodal, 0], strict=True)]
-    lagrange = []
-    for node in range(window + 1):
-        quotient = [0] * (window + 1)
-        for power in range(window, -1, -1):  # synthetic division by (t − node)
-            quotient[power] = nodal[power + 1] + (node * quotient[power + 1] if power < window else 0)
-        factor = (-1) ** (window - node) * math.comb(window, node)
-        lagrange.append([factor * c for c in quotient])
+    polynomials = lagrange(window)
     # Increment i raises the summed angle at every node after it.
-    summed = [[sum(column) for column in zip(*lagrange[i + 1 :], strict=True)] for i in range(window)]
+    summed = [[sum(column) for column in zip(*polynomials[i + 1 :], strict=True)] for i in range(window)]
     return tuple(tuple(power * c for power, c in enumerate(angle) if power) for angle in summed)
 
 
@@ -221,10 +227,9 @@ def rate_weights(points: int, interval: int) -> Rationals:
 
     Two points: the trapezoidal rule, ½ and ½. Four, the middle one: −1/24, 13/24, 13/24, −1/24.
     """
-    start = Fraction(interval)
-    powers = range(points)  # that the weights integrate exactly
-    integrals = [((start + 1) ** (k + 1) - start ** (k + 1)) / (k + 1) for k in powers]
-    return solve([[Fraction(node) ** k for node in range(points)] for k in powers], integrals)
+    integrals = [Fraction((interval + 1) ** k - interval**k, k) for k in range(1, points + 1)]
+    scale = math.factorial(points - 1)
+    return tuple(sum(map(operator.mul, row, integrals), Fraction(0)) / scale for row in lagrange(points - 1))
 
 
 def residuals(lags: Rationals, samples: int, terms: int) -> Rationals:
@@ -236,17 +241,3 @@ def residuals(lags: Rationals, samples: int, terms: int) -> Rationals:
         total.append((Fraction(samples**q, 2) - moment) * Fraction((-1) ** n, math.factorial(q)))
     total[0] -= Fraction(samples, 2)
     return tuple(total)
-
-
-def solve(matrix: list[list[Fraction]], right: list[Fraction]) -> Rationals:
-    """Return the exact solution of a square linear system (Gauss–Jordan)."""
-    n = len(right)
-    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
-    for i in range(n):
-        pivot = next(k for k in range(i, n) if rows[k][i] != 0)
-        rows[i], rows[pivot] = rows[pivot], rows[i]
-        rows[i] = [x / rows[i][i] for x in rows[i]]
-        for k in range(n):
-            if k != i and rows[k][i] != 0:
-                rows[k] = [x - rows[k][i] * y for x, y in zip(rows[k], rows[i], strict=True)]
-    return tuple(row[n] for row in rows)

@@ -23,15 +23,7 @@ from __future__ import annotations
 from strapdown.recordings.attitudes import Attitudes
 from strapdown.recordings.body_axes import axes_matrix, with_axes
 from strapdown.recordings.dataframes import from_table
-from strapdown.recordings.formats import (
-    FORMATS,
-    estimate_format,
-    format_of,
-    from_record,
-    read,
-    write,
-    writers,
-)
+from strapdown.recordings.formats import FORMATS, estimate_format, format_of, from_record, read, write, writers
 from strapdown.recordings.recordfiles import is_record
 from strapdown.recordings.samples import GyroSamples, read_samples, samples_of
 from strapdown.recordings.trajectories import read_tum, with_reference

@@ -149,10 +149,7 @@ def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
 
 
 def read_parquet(
-    file: Path,
-    *,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
+    file: Path, *, units: Mapping[str, str] | None = None, columns: Mapping[str, str] | None = None
 ) -> Recording:
     """Read a recording from Parquet; options as for :func:`strapdown.read`."""
     return naming.recording(parquet_table(file), units=units, columns=columns)

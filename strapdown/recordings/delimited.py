@@ -34,10 +34,7 @@ SEPARATORS = ",;\t|"
 
 
 def read_csv(
-    file: Path,
-    *,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
+    file: Path, *, units: Mapping[str, str] | None = None, columns: Mapping[str, str] | None = None
 ) -> Recording:
     """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 

@@ -24,17 +24,8 @@ from strapdown.results import WIDTH, default_of
 from strapdown.scenarios import toml
 from strapdown.scenarios.scenario import Scenario, Temperature
 
-_SYMBOLS = {
-    "deg": "°",
-    "degc": "°C",
-    "arcsec": "″",
-    "ratio": "1",
-    "hz": "Hz",
-    "nt": "nT",
-    "t": "T",
-    "hour": "h",
-    "sqrt": "√",
-}
+_SYMBOLS = {"deg": "°", "degc": "°C", "arcsec": "″", "ratio": "1", "hz": "Hz", "nt": "nT", "t": "T", "hour": "h"}
+_SYMBOLS |= {"sqrt": "√"}
 """Symbols of the words in the ending of a key that are not symbols themselves."""
 
 
@@ -165,13 +156,10 @@ def _gyro() -> Section:
 
 def _warm_gyro() -> Section:
     """Return the table of the bias over temperature, to first order."""
-    reference, span, each = (
-        "Temperature T₀ of the polynomial",
-        "temperature of the fit, beyond which the bias is constant",
-        [0.0] * 3,
-    )
+    span, each = "temperature of the fit, beyond which the bias is constant", [0.0] * 3
     keys = (
-        *(("reference_degc", "°C", "number", reference, 25.0), ("lowest_degc", "°C", "number", f"Lowest {span}", 0.0)),
+        ("reference_degc", "°C", "number", "Temperature T₀ of the polynomial", 25.0),
+        ("lowest_degc", "°C", "number", f"Lowest {span}", 0.0),
         ("highest_degc", "°C", "number", f"Highest {span}", 50.0),
         ("bias_rad_per_s", "rad/s", "list of 3", "Bias c₀ at T₀, body axes", each),
         ("bias_rad_per_s_per_k", "rad/s/K", "list of 3", "Slope c₁; for a higher order also …_per_k2, and so on", each),

@@ -91,9 +91,7 @@ def read(
 
 
 def write(
-    content: ImuRecord | Recording | Estimate | Scenario | FilterSetup,
-    path: str | os.PathLike[str],
-    **options: Any,
+    content: ImuRecord | Recording | Estimate | Scenario | FilterSetup, path: str | os.PathLike[str], **options: Any
 ) -> Path:
     """Write a record, recording, estimate, scenario or filter setup to a file, atomically.
 
