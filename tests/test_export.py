@@ -17,6 +17,7 @@ from strapdown.checks import InputError
 from strapdown.codegen import c, design
 from strapdown.codegen.functions import Function, Member
 from strapdown.codegen.interpreted import Interpreter
+from strapdown.codegen.symbols import Values
 from strapdown.codegen.writer import Writer
 from strapdown.estimation import setup as setups
 from strapdown.estimation.features import FEATURES
@@ -524,7 +525,7 @@ def test_kernels_with_branches_and_loops_are_those_of_python(tmp_path):
 def test_values_read_before_an_effect_are_those_before_it(tmp_path):
     """A load may not move behind a call or a branch that changes the array, nor be remembered after it."""
     m = Function("work", [("x", 0)])
-    P = m.array(lambda i: f"f->P[{i}]")
+    P = Values(m.trace, lambda i: f"f->P[{i}]")
     old = P[0]
     m.call("double_all")
     after = P[0]

@@ -10,18 +10,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
-
+from strapdown.allan import parameters, temperature
 from strapdown.allan.deviation import TERMS, AllanDeviation, allan_deviation, flicker_variance, model_deviation
 from strapdown.allan.noise_fit import UNITS, NoiseFit, curves_by_axis, fit_noise, to_gyro_parameters, upper_bounds
 from strapdown.allan.power_laws import NOISE_TYPES, equivalent_degrees_of_freedom
 
 __all__ = ["AllanDeviation", "NoiseFit", "allan_deviation", "fit_noise", "to_gyro_parameters"]
-
-
-def __getattr__(name: str) -> Any:
-    """Load a submodule on first use (PEP 562)."""
-    if name in ("parameters", "temperature"):
-        return import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

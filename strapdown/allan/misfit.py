@@ -31,9 +31,8 @@ def worst_misfit(
     misfits = []
     for coefficient, bins, segment in zip(coefficients, each, segments, strict=True):
         white = _whitened(coefficient, segment, theta, bins.first_slope + slope, terms, dt)
-        probability, what = min(
-            (*_of_series(white, segment.last, dt), _of_spectrum(bins, theta, slope)), key=lambda test: test[0]
-        )  # if several are 0, the first, which has a time
+        tests = (*_of_series(white, segment.last, dt), _of_spectrum(bins, theta, slope))
+        probability, what = min(tests, key=lambda test: test[0])  # if several are 0, the first, which has a time
         where = "" if len(segments) == 1 else f"in the segment from {segment.place.start * dt:.6g} s "
         misfits.append((min(1.0, 3.0 * probability), where + what))
     probability, what = min(misfits, key=lambda misfit: misfit[0])

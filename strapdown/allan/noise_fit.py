@@ -47,15 +47,10 @@ class Unit(NamedTuple):
     """Unit in the key of a file."""
 
 
-def _of_gyro(term: str, label: str) -> Unit:
-    suffix, factor = gyro.FORM[term][0]
-    return Unit(label, factor, term, suffix)
-
-
 _G, _HOUR = 1e-6 * units.STANDARD_GRAVITY, 3600.0
 UNITS: Mapping[str, Mapping[str, Unit]] = {
     "gyro": {
-        term: _of_gyro(term, label)
+        term: Unit(label, gyro.FORM[term][0][1], term, gyro.FORM[term][0][0])
         for term, label in zip(TERMS, ("arcsec", "°/√h", "°/h", "°/h/√h", "°/h/h"), strict=True)
     },
     "accelerometer": {

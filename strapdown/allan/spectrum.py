@@ -64,9 +64,8 @@ def expected_power(term: str, samples: int, dt: float, j: NDArray[np.int64]) -> 
         return np.asarray((laplacian + 4.0 / samples * np.cos(0.5 * theta) ** 2) / dt**2)
     spectrum = samples / (np.pi * j)  # B²/(2π f dt) at f dt = j/2n
     ratio = flicker_leakage(min(samples, LARGEST_EXACT))
-    known = (
-        len(ratio) if samples <= LARGEST_EXACT else len(ratio) // 8
-    )  # far from both ends the ratio depends only on j, and converges to 1
+    # Far from both ends the ratio depends only on j, and converges to 1.
+    known = len(ratio) if samples <= LARGEST_EXACT else len(ratio) // 8
     return np.asarray(spectrum * np.where(j < known, ratio[np.minimum(j, known - 1)], 1.0))
 
 

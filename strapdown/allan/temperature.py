@@ -259,9 +259,8 @@ def _over_walk(bins: _Bins) -> tuple[list[_Fit], Array]:
     grid = np.geomspace(grid[max(near[0] - 1, 0)], grid[min(near[-1] + 1, COARSE - 1)], FINE)
     fits = [held(size, flicker) for flicker in (False, True) for size in grid]
     cost = np.repeat([0.0, SUPPORT], FINE) + [fit.loss - best.loss for fit in fits]
-    density = (
-        np.tile(grid, 2) * np.sqrt([information(fit) for fit in fits]) * np.exp(cost.min() - cost)
-    )  # dθ = θ d ln θ
+    # dθ = θ d ln θ.
+    density = np.tile(grid, 2) * np.sqrt([information(fit) for fit in fits]) * np.exp(cost.min() - cost)
     return fits, density / density.sum()
 
 

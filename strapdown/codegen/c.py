@@ -13,7 +13,6 @@ from strapdown.codegen.target import Target
 from strapdown.codegen.writer import Language, Writer
 from strapdown.kernels import chains
 
-PUBLIC = ("init", "predict")
 SMALLEST = float(np.finfo(np.float32).tiny)
 """Smallest number with all its digits in single precision."""
 TYPES = {"": "strapdown_real", "int": "int", "wide": "double", "status": "unsigned"}
@@ -51,7 +50,7 @@ def is_public(function: Target) -> bool:
     """Return whether users of the filter call a function."""
     if function.program.recording is not None:
         return function.name in ("init", "update")
-    return function.name in PUBLIC or function.name.startswith("update_")
+    return function.name in ("init", "predict") or function.name.startswith("update_")
 
 
 def signature(function: Target) -> str:
@@ -89,13 +88,8 @@ def members(program: Program) -> list[tuple[str, int, str, str]]:
     ]
     if program.n > 6:
         rows.append(("states", program.n - 6, "error states: " + ", ".join(program.state_names)))
-    rows.append(
-        (
-            "P",
-            program.number_of_covariances,
-            "covariance of the errors of attitude, bias and states: upper triangle by rows",
-        )
-    )
+    triangle = "covariance of the errors of attitude, bias and states: upper triangle by rows"
+    rows.append(("P", program.number_of_covariances, triangle))
     rows.append(("nis", max(len(program.sensors), 1), "last normalised innovation squared of each sensor"))
     if program.structure.chains:
         rows.append(("coefficients", chains.SET * len(program.model.last), "of the states that decay, for steps of dt"))
@@ -256,11 +250,10 @@ int main(void) {{
 def example_of_recording(program: Program) -> str:
     """Return an example of the use of the filter of an IMU."""
     r = program.recording
-    vector = (
-        "\n        const strapdown_real magnetometer[3] = {0.0, 20.0, -43.0}; /* any unit */"
-        if r.imu.magnetometer
-        else ""
-    )
+    declaration, argument = "", ""
+    if r.imu.magnetometer:
+        declaration = "\n        const strapdown_real magnetometer[3] = {0.0, 20.0, -43.0}; /* any unit */"
+        argument = ", magnetometer"
     return f"""/* The filter over ten seconds of samples. */
 #include <stdio.h>
 
@@ -272,8 +265,8 @@ int main(void) {{
     strapdown_init(&f);
     for (int k = 0; k * {r.imu.interval!r} < 10.0; k++) {{
         const strapdown_real gyro[3] = {{0.0, 0.0, 0.0}}; /* rad/s, body axes: read the sensors here */
-        const strapdown_real accelerometer[3] = {{0.0, 0.0, (strapdown_real)9.81}}; /* m/s^2 */{vector}
-        if (strapdown_update(&f, k * {r.imu.interval!r}, gyro, accelerometer{", magnetometer" if r.imu.magnetometer else ""})) {{
+        const strapdown_real accelerometer[3] = {{0.0, 0.0, (strapdown_real)9.81}}; /* m/s^2 */{declaration}
+        if (strapdown_update(&f, k * {r.imu.interval!r}, gyro, accelerometer{argument})) {{
             /* not used: see the status */
         }}
     }}

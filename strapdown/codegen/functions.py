@@ -117,12 +117,6 @@ class Function:
         self.changing: set[str] = set()
         """Arrays whose elements may change after they are read."""
 
-    # ------------------------------------------------------------------------------------------------------------- arrays and parameters
-
-    def array(self, name: Callable[[int], str] | None = None) -> Values:
-        """Return an array; None: of elements that exist only while tracing."""
-        return Values(self.trace, name)
-
     def argument(self, name: str) -> Any:
         """Return a parameter: a symbol, a tuple of them, or an array that the function writes."""
         size = dict(self.parameters)[name]

@@ -18,7 +18,7 @@ from types import FunctionType, MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from strapdown.codegen.functions import Block, Statement
-from strapdown.codegen.symbols import Symbol, Trace
+from strapdown.codegen.symbols import Symbol, Trace, Values
 
 FORMULAS = ("strapdown.kernels", "strapdown.codegen")
 """Packages of functions that are executed on symbols."""
@@ -453,7 +453,7 @@ class Interpreter:
         if isinstance(result, tuple):
             m.results = len(result)
             m.parameters = [*m.parameters, ("result", -len(result))]
-            out = m.array(lambda i: f"result[{i}]")
+            out = Values(m.trace, lambda i: f"result[{i}]")
             for i, value in enumerate(result):
                 out[i] = value
         elif result is not None:

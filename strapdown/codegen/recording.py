@@ -330,18 +330,8 @@ def add_turn_variance(imu: Any) -> None:
         f.P[body.place(f.program.n, i, i)] += f.over_gap[0]
 
 
-REPLACED: dict[str, Any] = {
-    function.__name__: function
-    for function in (
-        predict_filter,
-        update_filter,
-        show_filter,
-        forget_attitude,
-        add_turn_variance,
-        end_step,
-        carry_to_sample,
-    )
-}
+_REPLACING = predict_filter, update_filter, show_filter, forget_attitude, add_turn_variance, end_step, carry_to_sample
+REPLACED: dict[str, Any] = {function.__name__: function for function in _REPLACING}
 
 
 def use_rest(f: Any) -> None:

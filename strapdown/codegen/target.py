@@ -15,7 +15,7 @@ from strapdown.codegen import recording
 from strapdown.codegen.functions import Function, Local, Member
 from strapdown.codegen.interpreted import Interpreter, Module, parsed
 from strapdown.codegen.program import Program, work_size
-from strapdown.codegen.symbols import Symbol
+from strapdown.codegen.symbols import Symbol, Values
 from strapdown.kernels import headings, rests
 from strapdown.units import DEGREE
 
@@ -37,25 +37,21 @@ class Target(Function):
         super().__init__(name, list(parameters.items()))
         self.words, self.program, self.functions = "", program, functions
         """Functions of the target by name."""
-        helpers: dict[str, Any] = {
-            "far_turn": self._far_turn,
-            "load": load,
-            "broadcast": broadcast,
-            "sum_lanes": sum_lanes,
-            "comment": self.comment,
-        }
+        helpers: dict[str, Any] = {"load": load, "broadcast": broadcast, "sum_lanes": sum_lanes}
+        helpers |= {"far_turn": self._far_turn, "comment": self.comment}
         helpers["call"] = lambda kernel, arguments, like: self.kernel(kernel, *arguments)
         self.kernel: Interpreter = Interpreter(self, helpers, OWN, recording.REPLACED)
+        array = functools.partial(Values, self.trace)
         self.state = f = SimpleNamespace(
             program=program,
             kernels=Module(program.kernels, self.kernel.unrolled),
             prediction=Module(program.prediction, self.kernel.unrolled),
-            x=self.array(name_of_state),
+            x=array(name_of_state),
             P=Member(self, "f->P", (program.number_of_covariances,)),
-            nis=self.array(lambda i: f"f->nis[{i}]"),
-            coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
-            dt=self.array(lambda i: "f->step_dt"),
-            status=self.array(lambda i: "f->status"),
+            nis=array(lambda i: f"f->nis[{i}]"),
+            coefficients=array(lambda i: f"f->coefficients[{i}]"),
+            dt=array(lambda i: "f->step_dt"),
+            status=array(lambda i: "f->status"),
             work=Local(self, "work", (work_size(program.kernels),)),
         )
         if program.recording is not None:

@@ -59,11 +59,8 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
     """
     import h5py
 
-    content = io.BytesIO()
-    with (
-        uninterrupted(),
-        h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file,
-    ):  # v110: attributes above 64 kB
+    content, versions = io.BytesIO(), ("v110", "v110")  # for attributes above 64 kB
+    with uninterrupted(), h5py.File(content, "w", userblock_size=BLOCK, libver=versions) as file:
         yield file
     held = content.getbuffer()
     held[:BLOCK] = _user_block(held[BLOCK:])

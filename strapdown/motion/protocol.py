@@ -101,11 +101,9 @@ def edge_stamps(edges: ArrayLike) -> Array:
     return checks.increasing("edges", edges, minimum=2)
 
 
-def store_number(motion: object, name: str, unit: str) -> float:
+def store_number(motion: object, name: str, unit: str) -> None:
     """Check a parameter of a frozen motion and store it as a finite float."""
-    value = checks.finite(name, getattr(motion, name), unit=unit)
-    object.__setattr__(motion, name, value)
-    return value
+    object.__setattr__(motion, name, checks.finite(name, getattr(motion, name), unit=unit))
 
 
 def store_vector(motion: object, name: str) -> tuple[float, ...]:

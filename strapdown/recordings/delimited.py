@@ -179,12 +179,7 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], units:
     """
     names = [f"{name} [{units[name]}]" if name in units else name for name in columns]
     separator = "\t" if path.suffix.lower() == ".tsv" else ","
-    texts = []
-    for column in columns.values():
-        if column.dtype.kind in "iu":
-            texts.append([str(x) for x in column.tolist()])
-        else:
-            texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
+    texts = [["" if math.isnan(x) else repr(x) for x in column.tolist()] for column in columns.values()]
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         file.write(separator.join(names) + "\n")
         file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

@@ -97,9 +97,8 @@ def euler_axes(attitude: ArrayLike) -> Array:
 
 def _turn_axes(angles: Array, sequence: str) -> Array:
     axes = [*sequence.upper()]
-    order = (
-        [0, 1, 2] if sequence == sequence.upper() else [2, 1, 0]
-    )  # rotations about fixed axes are those about body axes in reverse order
+    # Rotations about fixed axes are those about body axes in reverse order.
+    order = [0, 1, 2] if sequence == sequence.upper() else [2, 1, 0]
     directions = np.eye(3)[["XYZ".index(axes[k]) for k in order]]
     half = 0.5 * angles[:, order]
     turns = [

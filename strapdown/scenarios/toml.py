@@ -157,9 +157,7 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
 
 def _from_table(table: dict[str, Any], place: str) -> Scenario:
     for key, number in _numbers("", table):
-        if (
-            LARGEST_NUMBER < abs(number) <= float(np.finfo(float).max)
-        ):  # infinity is valid, as for a time that never comes
+        if LARGEST_NUMBER < abs(number) < np.inf:  # infinity is valid, as for a time that never comes
             raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
     known_keys(place, table, (*tables.keys(TOP_FORM), *_PARTS))
 

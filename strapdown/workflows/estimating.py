@@ -148,6 +148,8 @@ def smooth(
 ) -> Estimate:
     """Estimate attitude and gyro bias at each epoch from all measurements, before and after it (fixed-interval smoother).
 
+    Errors and warnings are those of :func:`estimate`; a record may also be too long for the memory.
+
     Parameters
     ----------
     source : ImuRecord or Recording
@@ -159,16 +161,6 @@ def smooth(
     -------
     Estimate
         Smoothed estimate at the same epochs and with the same fields as that of :func:`estimate`.
-
-    Raises
-    ------
-    InputError
-        As for :func:`estimate`, or if the record is too long for the memory.
-
-    Warns
-    -----
-    strapdown.ahrs.ConventionWarning, strapdown.ahrs.MotionWarning
-        As for :func:`estimate`.
 
     References
     ----------
