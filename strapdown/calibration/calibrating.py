@@ -237,10 +237,8 @@ def missing(calibration: UnitCalibration, strength: float = 1.0) -> tuple[str, .
         motion = _motion(name, axes)
         if sigma > wanted and sigma / wanted > lacking.get(motion, (0.0, ""))[0]:
             words, unit, factor = printed(name, axes, calibration.magnetic_unit)
-            lacking[motion] = (
-                sigma / wanted,
-                f"σ of {words} is {sigma / factor:.2g} {unit}, good is {wanted / factor:.2g}",
-            )
+            sentence = f"σ of {words} is {sigma / factor:.2g} {unit}, good is {wanted / factor:.2g}"
+            lacking[motion] = sigma / wanted, sentence
     return tuple(f"{motion}: {worst}." for motion, (_, worst) in lacking.items())
 
 

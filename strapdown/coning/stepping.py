@@ -187,13 +187,9 @@ def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160) -> float:
 
 def _is_plain(increments: ArrayLike) -> bool:
     """Return whether kernels can use the array of increments without conversion; its values are not checked."""
-    return (
-        isinstance(increments, np.ndarray)
-        and increments.dtype == np.float64
-        and increments.ndim == 2
-        and increments.shape[1] == 3
-        and increments.flags.c_contiguous
-    )
+    if not isinstance(increments, np.ndarray) or increments.dtype != np.float64:
+        return False
+    return increments.ndim == 2 and increments.shape[1] == 3 and increments.flags.c_contiguous
 
 
 def _increments(increments: ArrayLike) -> Array:

@@ -22,7 +22,7 @@ from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
-from strapdown.files.extras import library
+from strapdown.files import library
 from strapdown.montecarlo.engine import Identity, Parts, Work, Workers, identity, in_order
 
 __all__ = [

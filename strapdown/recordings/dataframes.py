@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError, numbers
-from strapdown.files import atomic_write, reading
-from strapdown.files.extras import library
+from strapdown.files import atomic_write, library, reading
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import date_ns, write_columns
 from strapdown.records import Estimate

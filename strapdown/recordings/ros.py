@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, one_of
-from strapdown.files import reading
-from strapdown.files.extras import library
+from strapdown.files import library, reading
 from strapdown.records import Estimate
 from strapdown.records.recording import Recording, beside, field_in, matched, relative_time, with_gyro
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.files.extras import library
+from strapdown.files import library
 from strapdown.records.recording import Recording, with_gyro
 from strapdown.units import DEGREE
 

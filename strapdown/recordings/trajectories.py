@@ -27,6 +27,7 @@ from strapdown.checks import Array, InputError, array, order_remedy
 from strapdown.files import atomic_write, reading
 from strapdown.recordings.delimited import is_number, read_csv
 from strapdown.records import Estimate
+from strapdown.records.estimate import frame_words
 from strapdown.records.recording import Recording, interpolated, whole_ns
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
@@ -133,7 +134,7 @@ def write_tum(estimate: Estimate, path: Path, *, frame: str = "ENU") -> None:
     q = np.stack([table[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
     stamps = whole_ns(estimate.time) + estimate.epoch_ns
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        context = [estimate.frame_words(frame), "smoothed" if estimate.smoothed else ""]
+        context = [frame_words(estimate.fixed_frame, frame), "smoothed" if estimate.smoothed else ""]
         file.write("; ".join(["# time tx ty tz qx qy qz qw", *filter(None, context)]) + "\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
             file.write(f"{Decimal(stamp).scaleb(-9):f} 0 0 0 {' '.join(map(repr, row))}\n")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.files.extras import library
+from strapdown.files import library
 from strapdown.records import outputs
 from strapdown.records.recording import Recording, beside, interpolated, relative_time, with_gyro
 

@@ -24,7 +24,7 @@ from strapdown.checks import (
     symmetric,
     unit_quaternions,
 )
-from strapdown.files.extras import library
+from strapdown.files import library
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import whole_ns
@@ -503,27 +503,9 @@ class Estimate(ByValue, Listed):
                 unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
                 columns[f"cov_body_{STATES[i]}{STATES[j]}_{unit}"] = self.covariance[:, i, j]
         context = {"smoothed": self.smoothed, "sigma_upper_bound": bool(self.motion)} if self.has_covariance else {}
-        if words := self.frame_words(frame):
+        if words := frame_words(self.fixed_frame, frame):
             context[f"fixed_frame_{re.sub('[^a-z]+', '_', words.partition(' (')[0].lower())}"] = True
         return columns | {name: np.full(len(q), value, np.int8) for name, value in context.items()}
-
-    def frame_words(self, frame: str) -> str:
-        """Return the fixed frame of exported attitudes in words, empty if it is that of the record's references.
-
-        Parameters
-        ----------
-        frame : {"ENU", "NED"}
-            Fixed frame of :meth:`table`.
-
-        Returns
-        -------
-        str
-            Its axes and its North.
-        """
-        if frame == "ENU":
-            return self.fixed_frame
-        down = self.fixed_frame.replace("East-North-Up", "North-East-Down").replace("z up", "z down")
-        return down or "North-East-Down"
 
     def to_dataframe(self, **options: Any) -> Any:
         """Return the estimate as a pandas ``DataFrame`` with the columns of :meth:`table`.
@@ -545,3 +527,10 @@ _NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 """Names of the angles of a sequence of three different axes."""
 STATES = ("x", "y", "z", "bx", "by", "bz")
 """Names of the components of the error state."""
+
+
+def frame_words(fixed_frame: str, frame: str) -> str:
+    """Return the axes and the North of exported attitudes from those of the estimate's frame; empty: those of the record's references."""
+    if frame == "ENU":
+        return fixed_frame
+    return fixed_frame.replace("East-North-Up", "North-East-Down").replace("z up", "z down") or "North-East-Down"

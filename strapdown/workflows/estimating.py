@@ -194,8 +194,8 @@ def run(
     instance("source", source, (ImuRecord, Recording), SOURCE)
     recorded = isinstance(source, Recording)
     of_records, of_recordings = (
-        ("setup", "initial", "states", "every"),
-        ("motion", "latency", "calibration", "temperature"),
+        ["setup", "initial", "states", "every"],
+        ["motion", "latency", "calibration", "temperature"],
     )
     for name in of_records if recorded else of_recordings:
         value = options.pop(name, None)
