@@ -30,7 +30,7 @@ from strapdown.checks import Hint, InputError, instance, one_of, positive
 from strapdown.codegen import c, design, javascript
 from strapdown.codegen.target import traced
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
-from strapdown.files import atomic_write, usable_folder, writable
+from strapdown.files import usable_folder, writable, write_text
 from strapdown.records import ImuRecord
 from strapdown.records.recording import LARGEST_FORCE
 from strapdown.vectors import VectorMeasurements, VectorSensor
@@ -124,8 +124,7 @@ def export(
     paths = [Path(folder) / name for name in texts]
     writable("folder", *paths)
     for path, text in zip(paths, texts.values(), strict=True):
-        with atomic_write(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text)
     return tuple(paths)
 
 

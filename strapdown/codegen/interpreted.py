@@ -117,18 +117,10 @@ def mathematics(trace: Trace) -> dict[str, Any]:
         plain = getattr(math, name)
         return lambda *x: trace.symbol(kind or name, *x) if any(isinstance(t, Symbol) for t in x) else plain(*x)
 
-    def less(a: Any, b: Any) -> Any:
-        return trace.select(b < a, b, a)
-
-    def greater(a: Any, b: Any) -> Any:
-        return trace.select(b > a, b, a)
-
-    names = ("sqrt", "exp", "expm1", "sin", "cos", "tan", "asin", "atan2")
-    functions = {name: function(name) for name in names}
+    names = ("sqrt", "exp", "expm1", "sin", "cos", "tan", "asin", "atan2", "trunc")
     space = SimpleNamespace(
-        **functions,
+        **{name: function(name) for name in names},
         floor=function("floor", "lowest"),
-        trunc=function("trunc"),
         copysign=lambda a, b: trace.select(b < 0.0, -abs(a), abs(a)),
         inf=math.inf,
         nan=math.nan,
@@ -137,8 +129,8 @@ def mathematics(trace: Trace) -> dict[str, Any]:
     return {
         "math": space,
         "abs": abs,
-        "min": less,
-        "max": greater,
+        "min": lambda a, b: trace.select(b < a, b, a),
+        "max": lambda a, b: trace.select(b > a, b, a),
         "square_root": trace.square_root,
         "select": trace.select,
         "any_lane": lambda condition: condition,
@@ -431,7 +423,8 @@ class Interpreter:
         m = self.m
         names = [a.arg for a in parsed(function).args.args]
         known = dict(zip(names, arguments, strict=False))
-        passed = {n: x for n, x in known.items() if type(x) is tuple or is_number(x) or n == "work"}
+        numeric = Symbol | int | float
+        passed = {n: x for n, x in known.items() if type(x) is tuple or isinstance(x, numeric) or n == "work"}
         name = m.name_of(function, known)
         if name not in m.functions:
             sizes = {
@@ -460,8 +453,3 @@ class Interpreter:
             m.returns = m.returns or "real"
             m.give(result)
         m.flush()
-
-
-def is_number(value: Any) -> bool:
-    """Return whether a value is a number of the target or of Python."""
-    return isinstance(value, Symbol | int | float)

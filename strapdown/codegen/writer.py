@@ -47,11 +47,6 @@ class Language:
     """A quotient of positive integers rounded down."""
 
 
-def vector(name: str, size: Any) -> list[str]:
-    """Return the elements of a parameter that is a vector."""
-    return [f"{name}[{i}]" for i in range(size)] if isinstance(size, int) else []
-
-
 class Writer:
     """The lines of a function."""
 
@@ -142,7 +137,8 @@ class Writer:
                 arguments.append(value)
             elif isinstance(value, tuple):
                 texts = [self.text(x) for x in value]
-                whole = [name for name, size in self.function.parameters if texts == vector(name, size)]
+                vectors = ((name, size) for name, size in self.function.parameters if isinstance(size, int))
+                whole = [name for name, size in vectors if texts == [f"{name}[{i}]" for i in range(size)]]
                 arguments.append(whole[0] if whole else self.language.numbers(texts))
             else:
                 arguments.append(self.text(value, "int" if isinstance(value, int) else ""))

@@ -38,7 +38,6 @@ class Motion(Protocol):
         ndarray (..., 4)
             Unit quaternions q_fb.
         """
-        ...
 
     def body_rate(self, time: ArrayLike) -> Array:
         """Return the angular rate in body axes, w_b of equation (17) of *Quaternion differentiation*.
@@ -53,7 +52,6 @@ class Motion(Protocol):
         ndarray (..., 3)
             w_b, rad/s.
         """
-        ...
 
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return the angular acceleration in body axes, dw_b/dt.
@@ -68,7 +66,6 @@ class Motion(Protocol):
         ndarray (..., 3)
             dw_b/dt, rad/s².
         """
-        ...
 
     def increments(self, edges: ArrayLike) -> Array:
         """Return the rotation increments, ∫ w_b dt over each interval between consecutive edges.
@@ -83,7 +80,6 @@ class Motion(Protocol):
         ndarray (n, 3)
             Increments in body axes, rad.
         """
-        ...
 
 
 def break_times(name: str, motion: Motion) -> Array:

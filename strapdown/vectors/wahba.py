@@ -36,6 +36,8 @@ MIN_WEIGHT = 1e-12
 
 ROUNDING = 1e-15
 """Rounding error of the direction of a unit vector, rad."""
+MAX_STEPS = 10
+"""Maximum number of Gauss–Newton steps."""
 
 
 def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
@@ -189,16 +191,13 @@ def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array,
 
 def _refined(attitude: Array, b: Array, r: Array, sigma: Array) -> Array:
     """Return the attitude after Gauss–Newton steps on Wahba's loss, down to the size of rounding errors."""
-    for _ in range(_GAUSS_NEWTON_STEPS):
+    for _ in range(MAX_STEPS):
         predicted = _to_body(attitude, r)
         step = np.linalg.solve(*_factorised(predicted, b - predicted, sigma))
         attitude = quaternion.normalize(quaternion.multiply(attitude, quaternion.exp(step)))
         if np.max(np.abs(step)) < ROUNDING:
             break
     return attitude
-
-
-_GAUSS_NEWTON_STEPS = 10
 
 
 def _directions(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
