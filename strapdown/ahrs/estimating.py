@@ -28,7 +28,7 @@ from strapdown.ahrs.starting import (
     take_rate_at_rest,
     with_all_rests,
 )
-from strapdown.calibration import UnitCalibration, with_gyro_states
+from strapdown.calibration import UnitCalibration, iron_sigma, with_gyro_states
 from strapdown.checks import Array, lengths, median
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
@@ -199,7 +199,7 @@ def _of_unit(parameters: AhrsParameters, calibration: UnitCalibration, used: Rec
         parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
     if used.magnetic_field is not None and calibration.sigma.hard_iron.any():
         size = lengths(used.magnetic_field)
-        sigma = calibration.iron_sigma(used) / median(size[np.isfinite(size)])
+        sigma = iron_sigma(calibration, used) / median(size[np.isfinite(size)])
         parameters = replace(parameters, unshown_iron_sigma=min(sigma, parameters.unshown_iron_sigma))
     return parameters
 

@@ -9,6 +9,6 @@
 from __future__ import annotations
 
 from strapdown.calibration.calibrating import calibrate
-from strapdown.calibration.unit import SensorErrors, UnitCalibration, read, with_gyro_states, write
+from strapdown.calibration.unit import SensorErrors, UnitCalibration, iron_sigma, read, with_gyro_states, write
 
 __all__ = ["SensorErrors", "UnitCalibration", "calibrate", "read", "write"]

@@ -144,21 +144,6 @@ class UnitCalibration(SensorErrors, Listed):
         """Root mean square of the standard deviations of the entries of the gyro's matrix; 0: unknown."""
         return float(np.sqrt(np.mean(self.sigma.gyro_matrix**2)))
 
-    def iron_sigma(self, recording: Recording) -> float:
-        """Return σ of the hard iron.
-
-        Parameters
-        ----------
-        recording : Recording
-            Recording of the same unit.
-
-        Returns
-        -------
-        float
-            Root mean square of the standard deviations of its components, in the unit of the recording's field; 0: unknown.
-        """
-        return float(np.sqrt(np.mean(self.sigma.hard_iron**2))) * self._unit_ratio(recording)
-
     def applied(self, recording: Recording) -> Recording:
         """Return a recording of the same unit with its samples corrected; the delays are left to the estimator.
 
@@ -209,6 +194,11 @@ class UnitCalibration(SensorErrors, Listed):
             rows.append((words, unit, value / factor, sigma / factor))
         title = f"Calibration from {self.source or 'an unknown source'}"
         return Table(title, ("error", "unit", "value", Column("σ", digits=2)), rows, self.remarks, left=2)
+
+
+def iron_sigma(calibration: UnitCalibration, recording: Recording) -> float:
+    """Return the root mean square of σ of the components of the hard iron, in the unit of a recording's field; 0: unknown."""
+    return float(np.sqrt(np.mean(calibration.sigma.hard_iron**2))) * calibration._unit_ratio(recording)
 
 
 def _corrected(samples: Array, bias: Array, matrix: Array) -> Array:

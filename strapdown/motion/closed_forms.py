@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.exact_phase import DIGITS, cosine_sine, exact_sum, harmonic_integrals, to_decimal, to_pair
-from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_number, store_vector, times
+from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_numbers, store_vector, times
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +142,7 @@ class Coning(_Cone):
 
     def __post_init__(self) -> None:
         self._store_angle()
-        store_number(self, "frequency", "Hz")
+        store_numbers(self, frequency="Hz")
 
     @property
     def rate(self) -> float:
@@ -184,8 +184,7 @@ class SpinCone(_Cone):
     angle: float
 
     def __post_init__(self) -> None:
-        store_number(self, "precession_rate", "rad/s")
-        store_number(self, "spin_rate", "rad/s")
+        store_numbers(self, precession_rate="rad/s", spin_rate="rad/s")
         self._store_angle()
 
     def attitude(self, time: ArrayLike) -> Array:
@@ -223,10 +222,7 @@ class SpinRock:
     rock_phase: float = 0.0
 
     def __post_init__(self) -> None:
-        store_number(self, "rock_angle", "rad")
-        store_number(self, "rock_frequency", "Hz")
-        store_number(self, "spin_rate", "rad/s")
-        store_number(self, "rock_phase", "rad")
+        store_numbers(self, rock_angle="rad", rock_frequency="Hz", spin_rate="rad/s", rock_phase="rad")
 
     @property
     def rock_rate(self) -> float:
@@ -300,7 +296,7 @@ class Slew:
     def __post_init__(self) -> None:
         store_vector(self, "rotation_vector")
         object.__setattr__(self, "duration", checks.positive("duration", self.duration, unit="s"))
-        store_number(self, "start", "s")
+        store_numbers(self, start="s")
         store_attitude(self)
 
     @property

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.exact_phase import cosine_sine, harmonic_integrals
-from strapdown.motion.protocol import IDENTITY, edge_stamps, store_attitude, store_number, store_vector, times
+from strapdown.motion.protocol import IDENTITY, edge_stamps, store_attitude, store_numbers, store_vector, times
 
 _TERMS = 26
 _TRUNCATION = 1e-21
@@ -42,8 +42,7 @@ class Harmonic:
 
     def __post_init__(self) -> None:
         store_vector(self, "amplitude")
-        store_number(self, "frequency", "Hz")
-        store_number(self, "phase", "rad")
+        store_numbers(self, frequency="Hz", phase="rad")
 
     @property
     def rate(self) -> float:

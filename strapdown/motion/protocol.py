@@ -97,9 +97,10 @@ def edge_stamps(edges: ArrayLike) -> Array:
     return checks.increasing("edges", edges, minimum=2)
 
 
-def store_number(motion: object, name: str, unit: str) -> None:
-    """Check a parameter of a frozen motion and store it as a finite float."""
-    object.__setattr__(motion, name, checks.finite(name, getattr(motion, name), unit=unit))
+def store_numbers(motion: object, **units: str) -> None:
+    """Check parameters of a frozen motion, by name, in these units, and store them as finite floats."""
+    for name, unit in units.items():
+        object.__setattr__(motion, name, checks.finite(name, getattr(motion, name), unit=unit))
 
 
 def store_vector(motion: object, name: str) -> tuple[float, ...]:

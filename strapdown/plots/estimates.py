@@ -18,6 +18,7 @@ from strapdown.consistency import errors
 from strapdown.plots import style
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
 from strapdown.records import Estimate, Truth, outputs
+from strapdown.records.estimate import state_unit
 from strapdown.units import DEGREE, angle_unit, error_state_name, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
@@ -137,14 +138,14 @@ def _attitude_sigma(ax: Axes, estimate: Estimate) -> None:
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     """Draw the error states of an estimate over time with their ±3σ, one axes for each declaration and unit, in their order."""
     panels = [
-        (name, block, unit, [k for k, state_unit in enumerate(block.units) if state_unit == unit])
+        (name, block, unit, [k for k, each in enumerate(block.units) if each == unit])
         for name, block in estimate.error_states.items()
         for unit in dict.fromkeys(block.units)
     ]
     figure, grid = style.new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
     axes = np.atleast_1d(grid)
     for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
-        word, size = estimate.state_unit(name, unit)
+        word, size = state_unit(estimate, name, unit)
         values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
         for k, member in enumerate(members):
             color = style.CYCLE[k % len(style.CYCLE)]

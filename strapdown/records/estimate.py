@@ -267,26 +267,6 @@ class Estimate(ByValue, Listed):
         span = self.time[-1] - self.time[0]
         return f"{len(self.time)} epochs over {span:.6g} s, {measurements} measurements, {truth}"
 
-    def state_unit(self, name: str, unit: str) -> tuple[str, float]:
-        """Return the printed unit of an error state and its factor to SI; states of a direction or a heading are relative to its vector.
-
-        Parameters
-        ----------
-        name : str
-            Name of the declaration in ``error_states``.
-        unit : str
-            SI unit of the state.
-
-        Returns
-        -------
-        str, float
-            Name of the unit, and its factor to SI.
-        """
-        across = [f"{sensor} " for sensor, series in self.innovations.items() if series.innovation.shape[1] < 3]
-        if unit == "1" and name.startswith(tuple(across)):
-            return "% of the vector", 0.01
-        return error_state_unit(name, unit)
-
     def listing(self) -> Table:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
         rows: list[tuple[Any, ...]] = []
@@ -296,7 +276,7 @@ class Estimate(ByValue, Listed):
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
-                label, (word, size) = error_state_name(name, component, unit), self.state_unit(name, unit)
+                label, (word, size) = error_state_name(name, component, unit), state_unit(self, name, unit)
                 rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, innovations in self.innovations.items():
@@ -534,3 +514,11 @@ def frame_words(fixed_frame: str, frame: str) -> str:
     if frame == "ENU":
         return fixed_frame
     return fixed_frame.replace("East-North-Up", "North-East-Down").replace("z up", "z down") or "North-East-Down"
+
+
+def state_unit(estimate: Estimate, name: str, unit: str) -> tuple[str, float]:
+    """Return the printed unit of an error state, and its factor to SI; that of a direction or a heading is relative to its vector."""
+    across = [f"{sensor} " for sensor, series in estimate.innovations.items() if series.innovation.shape[1] < 3]
+    if unit == "1" and name.startswith(tuple(across)):
+        return "% of the vector", 0.01
+    return error_state_unit(name, unit)

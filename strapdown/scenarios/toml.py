@@ -157,7 +157,8 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
 
 def _from_table(table: dict[str, Any], place: str) -> Scenario:
     for key, number in _numbers("", table):
-        if LARGEST_NUMBER < abs(number) < np.inf:  # infinity is valid, as for a time that never comes
+        # Infinity is valid, as for a time that never comes.
+        if LARGEST_NUMBER < abs(number) <= float(np.finfo(float).max):
             raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
     known_keys(place, table, (*tables.keys(TOP_FORM), *_PARTS))
 
@@ -238,9 +239,8 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
     name = table.pop("preset", "")
     if not name:
         return "", gyro.from_table(table, place)
-    from strapdown.gyro import datasheets
-
-    spec = datasheets.PRESETS[one_of(f"{place}: preset", name, datasheets.PRESETS)].spec
+    presets = gyro.datasheets.PRESETS
+    spec = presets[one_of(f"{place}: preset", name, presets)].spec
     return ("", gyro.from_table(table, place, spec)) if table else (name, spec)
 
 

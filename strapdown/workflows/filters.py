@@ -33,11 +33,10 @@ def specification_of(noise: GyroSpec | NoiseFit) -> GyroSpec:
 
 def gyro_of(preset_or_path: str) -> GyroSpec:
     """Return the specification of a preset, or of a TOML file."""
-    from strapdown.gyro import datasheets
-
     if preset_or_path.endswith(".toml"):
         return gyro.read_spec(preset_or_path)
-    return datasheets.PRESETS[one_of("prior", preset_or_path, datasheets.PRESETS)].spec
+    presets = gyro.datasheets.PRESETS
+    return presets[one_of("prior", preset_or_path, presets)].spec
 
 
 def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:

@@ -43,10 +43,10 @@ def integrate(
     rule = coning.named(algorithm)
     instance("source", source, (ImuRecord, Recording), SOURCE)
     if isinstance(source, ImuRecord):
-        time, increments = source.time, source.increments
+        time, increments, origin = source.time, source.increments, source.origin
         known, place = None if source.truth is None else source.truth.attitude, "the record"
     else:
-        place = source.source
+        place, origin = source.source, Origin(source=source.source, epoch_ns=source.epoch_ns)
         time, increments, known = source.time, recordings.increments(source), source.true_attitude
     if len(increments) < rule.samples:
         raise InputError(
@@ -77,9 +77,7 @@ def integrate(
         bias=np.broadcast_to(np.nan, (len(steps), 3)),
         variance=np.broadcast_to(np.nan, (len(steps), 6)),
         covariance=np.broadcast_to(np.nan, (len(steps), 6, 6)),
-        origin=source.origin
-        if isinstance(source, ImuRecord)
-        else Origin(source=source.source, epoch_ns=source.epoch_ns),
+        origin=origin,
         remarks=tuple(filter(None, remarks)),
         details={"algorithm": rule.name},
     )
