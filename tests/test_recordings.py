@@ -12,7 +12,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord, result_file
-from strapdown.records.recording import at_nearest, gaps
+from strapdown.records.recording import at_nearest, gaps, rows_of
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -207,9 +207,9 @@ def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):
 
 def test_rows_of_times_are_those_of_their_stamps():
     recording = Recording(source="a", time=0.5 * np.arange(4.0), rate=np.ones((4, 3)))
-    np.testing.assert_array_equal(recording.rows_of(np.array([0.0, 1.0, 1.5])), [0, 2, 3])
+    np.testing.assert_array_equal(rows_of(recording, np.array([0.0, 1.0, 1.5])), [0, 2, 3])
     with pytest.raises(InputError):
-        recording.rows_of(np.array([0.25]))
+        rows_of(recording, np.array([0.25]))
 
 
 def test_vectors_of_a_record_are_at_their_stamps():

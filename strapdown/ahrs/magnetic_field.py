@@ -13,7 +13,7 @@ from strapdown.ahrs.remarks import MAGNETIC_NORTH
 from strapdown.checks import Array, InputError, finite, lengths
 from strapdown.recordings import Recording
 from strapdown.records import Estimate
-from strapdown.records.recording import MAGNETIC_UNITS, sampled
+from strapdown.records.recording import MAGNETIC_UNITS, rows_of, sampled
 from strapdown.units import DEGREE
 
 TRUE_NORTH = "East-North-Up, true North"
@@ -152,7 +152,7 @@ class MagneticField:
         """
         if recording.magnetic_field is None:
             raise InputError(f"{recording.source} has no magnetometer; give a recording that has one")
-        samples = recording.magnetic_field[recording.rows_of(estimate.time)]
+        samples = recording.magnetic_field[rows_of(recording, estimate.time)]
         known = sampled(samples)
         size = np.where(known, lengths(samples), np.nan)
         unit = MAGNETIC_UNITS.get(recording.magnetic_unit) or self.strength / float(np.nanmedian(size))

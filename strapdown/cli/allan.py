@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from typer import Argument, Option
 
@@ -58,10 +59,10 @@ def allan(
     positive("--factor", output.factor)
     if options.temperature is not None:
         count("--temperature", options.temperature)
-    kalibr = {"factor": output.factor, "topic": samples.topic or "/imu0"}
-    exports = {}
+    kalibr = partial(sd.allan.parameters.to_kalibr, factor=output.factor, topic=samples.topic or "/imu0")
+    exports: dict[Path, Any] = {}
     for name, wanted, to in (
-        ("imu.yaml", output.kalibr, partial(sd.allan.parameters.to_kalibr, **kalibr)),
+        ("imu.yaml", output.kalibr, kalibr),
         ("px4.params", output.px4, sd.allan.parameters.to_px4),
         ("imu_sensor.m", output.matlab, sd.allan.parameters.to_matlab),
     ):

@@ -182,27 +182,6 @@ class Recording(Listed):
         missing, repeated = (x[(begin < x) & (x <= end)] for x in (self.missing_gyro, self.repeated))
         return replace(self, missing_gyro=missing, repeated=repeated, **parts)
 
-    def rows_of(self, time: Array) -> NDArray[np.int64]:
-        """Return the row of each time of an estimate, all of which must be stamps of the recording.
-
-        Parameters
-        ----------
-        time : ndarray (m,)
-            Times, s.
-
-        Returns
-        -------
-        ndarray (m,) of int
-            Rows.
-        """
-        rows, same = matched(self.time, time, 1e-6)
-        if not same.all():
-            missing = time[np.argmin(same)]
-            raise InputError(
-                f"{self.source} has no stamp {missing:.6g} s, as the estimate has; give the recording it was made from"
-            )
-        return rows
-
     @property
     def clock_ns(self) -> NDArray[np.int64]:
         """Time stamps (n,) of the source's clock, ns."""
@@ -294,6 +273,15 @@ def matched(stamps: Array, time: Array, tolerance: float) -> tuple[NDArray[np.in
     """Return for each time (m,) the row of the same stamp in ``stamps`` (n,), and whether there is one within a tolerance, s."""
     rows = np.minimum(np.searchsorted(stamps, time - tolerance), len(stamps) - 1)
     return rows, np.abs(stamps[rows] - time) <= tolerance
+
+
+def rows_of(recording: Recording, time: Array) -> NDArray[np.int64]:
+    """Return the row of each time (m,) of an estimate, all of which must be stamps of the recording."""
+    rows, same = matched(recording.time, time, 1e-6)
+    if not same.all():
+        missing = f"{recording.source} has no stamp {time[np.argmin(same)]:.6g} s, as the estimate has"
+        raise InputError(f"{missing}; give the recording it was made from")
+    return rows
 
 
 def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:

@@ -81,7 +81,7 @@ class Solution:
     covariance : ndarray (3, 3)
         Covariance of the body-side error δθ, q_true = q ⊗ exp(δθ), rad²: ``[Σ (I − b bᵀ)/σ²]⁻¹``.
     loss : float
-        Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum.
+        Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum, half of a χ² with ``dof`` degrees of freedom if the data are correct.
     dof : int
         Degrees of freedom of the residual: two per direction, less three.
     """
@@ -92,16 +92,11 @@ class Solution:
     dof: int
 
     @property
-    def chi_square(self) -> float:
-        """Twice the loss: χ² with ``dof`` degrees of freedom if directions and σ are correct."""
-        return 2.0 * self.loss
-
-    @property
     def probability(self) -> float:
         """Probability of a residual at least as large with correct data. Near 0: outlier, wrong reference or σ too small."""
         from scipy.special import chdtrc
 
-        return float(chdtrc(self.dof, self.chi_square))
+        return float(chdtrc(self.dof, 2.0 * self.loss))
 
 
 def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> Solution:

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Hint, InputError, instance
+from strapdown.checks import InputError, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
 from strapdown.consistency.accuracy import accuracy_of
 from strapdown.consistency.alignment import Series
-from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
 from strapdown.recordings import Recording
 from strapdown.recordings.attitudes import Attitudes
@@ -81,18 +80,16 @@ def check(
 
 
 def diagnose(
-    result: Estimate, record: ImuRecord, *, setup: FilterSetup | None = None, judgement: Judgement | None = None
+    result: Estimate, record: ImuRecord, *, judgement: Judgement | None = None
 ) -> tuple[Diagnosis | None, str]:
     """Search for the causes of an inconsistency, as ``strapdown check`` with a record does.
 
     Parameters
     ----------
     result : Estimate
-        Result of :func:`estimate`.
+        Result of :func:`estimate`, with its filter.
     record : ImuRecord
         The record from which it was made.
-    setup : FilterSetup, optional
-        The filter that made it. Default: that of the estimate.
     judgement : Judgement, optional
         The verdict of :func:`check`, with which the causes are combined.
 
@@ -112,9 +109,9 @@ def diagnose(
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
-    filter_setup = result.setup if setup is None else setup
+    filter_setup = result.setup
     if filter_setup is None:
-        raise InputError(f"the estimate does not contain its filter; give it, {Hint('setup')}")
+        raise InputError("the estimate does not contain its filter; give one made by estimate")
     unknown = sorted(set(result.innovations) - {series.sensor for series in record.vectors})
     if unknown or not np.isin(result.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
