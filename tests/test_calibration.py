@@ -182,7 +182,7 @@ def test_an_interval_begins_with_the_sample_after_its_edge():
     time, edges = np.arange(41) / 16.0, [0, *range(3, 40, 4), 40]
     ramp = time[:, None] * [1.0, -2.0, 3.0]
     gathered = intervals.gathered([Recording(source="ramp", time=time, rate=ramp, specific_force=ramp)])
-    np.testing.assert_allclose(gathered.time, time[edges])
+    np.testing.assert_array_equal(gathered.node_rate, ramp[edges])
     np.testing.assert_allclose(gathered.length, np.diff(time[edges]))
     np.testing.assert_allclose(gathered.angle.sum(axis=1), 0.5 * np.diff(time[edges] ** 2)[:, None] * [1.0, -2.0, 3.0])
     np.testing.assert_array_equal(gathered.force.number, np.diff(edges))
@@ -227,7 +227,7 @@ def test_the_equations_have_the_derivatives_of_their_differences(turned):
     """Without a lever arm: what its velocity depends on the errors of the gyro is left out."""
     gathered = intervals.gathered([turned[1]])
     random = np.random.default_rng(6)
-    nodes = 0.02 * random.standard_normal((len(gathered.time), 12))
+    nodes = 0.02 * random.standard_normal((len(gathered.node_rate), 12))
     nodes[:, fitting.LEVER - 3 : fitting.LEVER] = 0.0
     errors, small = 0.02 * random.standard_normal(33), 0.02 * random.standard_normal((len(nodes), 3))
     turn = intervals.predicted(gathered, fitting.unpacked(errors), np.zeros((len(gathered.node), 3))).turn
@@ -259,7 +259,7 @@ def test_sigma_of_the_field_matrix_is_that_of_its_mean_scale_of_one(turned):
     root, errors = 1e-2 * random.standard_normal((36, 36)), np.zeros(33)
     errors[fitting.FIELD] = (0.4 * np.eye(3) + 0.1 * random.standard_normal((3, 3))).ravel()
     unknowns = fitting.Unknowns(errors, np.eye(3)[None], np.zeros((1, 12)))
-    fit = fitting.Fit(unknowns, root @ root.T, {})
+    fit = fitting.Fit(unknowns, root @ root.T)
     unit = calibrating._result(fit, fitting.Prior(errors, errors), 1.0, [turned[1]])
 
     def scaled(change):
