@@ -83,9 +83,9 @@ def fit_temperature(
     Parameters
     ----------
     values : array_like (n,) or (n, axes)
-        Averaged samples at rest, SI.
+        Averaged samples at rest, SI, at least 64 without gaps.
     temperature : array_like (n,)
-        Temperature of the sensor, °C.
+        Temperature of the sensor, °C, which changes by 0.5 K or more.
     sample_interval : float
         Sample interval, s.
     order : int, default 1
@@ -95,11 +95,6 @@ def fit_temperature(
     -------
     TemperatureFit
         Coefficients with intervals, and the record less the dependence.
-
-    Raises
-    ------
-    InputError
-        If the temperature spans less than 0.5 K, or samples are missing, too few or constant.
     """
     x = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
     x = x[:, None] if x.ndim == 1 else x

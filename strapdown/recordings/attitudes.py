@@ -166,16 +166,18 @@ def _own(path: Path, kind: str) -> Attitudes:
     """Read a result of this package, of this kind."""
     if kind == "strapdown estimate":
         with reading.hdf5(path) as file:
-            optional = {name for name in ("covariance", "variance", "bias") if name in file}
-            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude", *optional)}
+            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude")}
+            P = reading.numbers(file, "covariance") if "covariance" in file else None
+            if P is None and "variance" in file:
+                variance = reading.numbers(file, "variance")
+                P = variance[:, :, None] * np.eye(variance.shape[1])
+            bias = reading.numbers(file, "bias") if "bias" in file else None
             innovations = result_files.innovations(file)
             attributes = reading.attributes(file)
         known = are_finite(arrays["attitude"])
         if not known.any():
             raise InputError(f"{path} is an estimate without a single attitude, because its filter failed; repeat it")
-        time, P, bias = arrays["time"][known], arrays.get("covariance"), arrays.get("bias")
-        if P is None and "variance" in arrays:
-            P = arrays["variance"][:, :, None] * np.eye(arrays["variance"].shape[1])
+        time = arrays["time"][known]
         return Attitudes(
             source=path.name,
             stamps_ns=whole_ns(time) + recordfiles.epoch_of(attributes),

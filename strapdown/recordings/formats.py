@@ -174,23 +174,23 @@ _REASONS = {
 def read(
     path: str | os.PathLike[str],
     *,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    topic: str = "",
     axes: str | Mapping[str, str] | None = None,
     invert: str | Iterable[str] = (),
-    **options: Any,
 ) -> Recording:
-    """Read a recording of any format, recognised by its content: a file, or a folder.
-
-    ``options``: ``units``, ``columns`` and ``topic``; all are as for :func:`strapdown.read`.
-    """
+    """Read a recording of any format, recognised by its content: a file, or a folder; options as for :func:`strapdown.read`."""
     file = Path(path)
     file_format = format_of(file)
     if file_format.read is None:
         raise InputError(
             f"{file.name} is a {file_format.name}, which has no inertial samples; give it as the reference of a recording"
         )
-    for name, value in options.items():
-        if value and name not in file_format.options:
-            raise InputError(f"{file.name} ({file_format.name}): {_REASONS[name]} leave {Hint(name, value)} out")
+    options = {"units": units or {}, "columns": columns or {}, "topic": topic}
+    for name, reason in _REASONS.items():
+        if options[name] and name not in file_format.options:
+            raise InputError(f"{file.name} ({file_format.name}): {reason} leave {Hint(name, options[name])} out")
     options = {name: value for name, value in options.items() if name in file_format.options}
     with reading.from_file(file, file_format.name):
         recording: Recording = file_format.read(file, **options)

@@ -112,7 +112,7 @@ def _refuse_repeated_time(place: str, stamps: NDArray[np.int64]) -> None:
 # ----------------------------------------------------------------------------------------------------------- reading
 
 
-def read_bag(file: Path, *, topic: str = "") -> Recording:
+def read_bag(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     topics = topics_of(file, READ)
     topic_name = topic_of(file.name, topics, topic, "inertial units", [IMU]).name

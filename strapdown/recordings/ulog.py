@@ -34,7 +34,7 @@ LATE = 0.5
 """Minimum time offset of the accelerometer, in sample intervals, that is reported."""
 
 
-def read_ulog(file: Path, *, topic: str = "") -> Recording:
+def read_ulog(file: Path, *, topic: str) -> Recording:
     """Read the inertial unit of a flight log."""
     log = opened(file, [UNIT, FIELD, ATTITUDE, TRUTH])
     data = {
