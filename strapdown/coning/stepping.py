@@ -220,11 +220,8 @@ def _steps(increments: Array, table: Algorithm) -> Array:
         window = min(table.window, len(increments))
         correction = table.correction_array if window == table.window else np.zeros((1, 1))
         previous = table.previous if window == table.window else len(increments)
-        rates = np.empty((4, window))
-        series = np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4))
-        compiled(kernels.polynomial_steps)(
-            increments, table.samples, previous, _fits(window), correction, rates, series, steps
-        )
+        fits = _fits(window)
+        compiled(kernels.polynomial_steps)(increments, table.samples, previous, fits, correction, *_work(window), steps)
         return steps
     compiled(kernels.magnus_steps)(increments, exact.floats(exact.magnus_moments(table.samples)), steps)
     return steps
@@ -255,21 +252,15 @@ def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tup
     if len(uneven) == 0:
         return none
     steps = np.empty((len(uneven), 4))
-    compiled(integration_uneven.uneven_steps)(
-        increments,
-        stamps,
-        uneven,
-        table.samples,
-        previous,
-        window,
-        GAP,
-        LOPSIDED,
-        np.empty((integration_uneven.ROWS, window + 1)),
-        np.empty((4, window)),
-        np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4)),
-        steps,
-    )
+    limits = table.samples, previous, window, GAP, LOPSIDED
+    nodes = np.empty((integration_uneven.ROWS, window + 1))
+    compiled(integration_uneven.uneven_steps)(increments, stamps, uneven, *limits, nodes, *_work(window), steps)
     return uneven, steps
+
+
+def _work(window: int) -> tuple[Array, Array]:
+    """Return the work space of the polynomial solver: the rate polynomial, and the power series of the quaternion."""
+    return np.empty((4, window)), np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4))
 
 
 def _compressed_array(table: Algorithm, previous: int) -> Array:
