@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array
+from strapdown.kernels.machine import compiled
+from strapdown.kernels.motion_harmonic import chain, evaluate, node_deviations
 from strapdown.motion.exact_phase import cosine_sine, harmonic_integrals
 from strapdown.motion.protocol import IDENTITY, edge_stamps, store_attitude, store_numbers, store_vector, times
 
@@ -139,9 +141,6 @@ class HarmonicRates:
 
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""
-        from strapdown.kernels.machine import compiled
-        from strapdown.kernels.motion_harmonic import evaluate
-
         t = times(time)
         flat = t.ravel()
         if flat.size == 0:
@@ -196,11 +195,7 @@ def _grown(nodes: float) -> int:
 @functools.lru_cache(maxsize=8)
 def _chained(motion: HarmonicRates, spacing: float, direction: int, last: int) -> tuple[Array, Array]:
     """Return the attitudes (last + 1, 4) at the nodes 0, ±1, …, ±last, as high and low parts."""
-    from strapdown.kernels.machine import compiled
-    from strapdown.kernels.motion_harmonic import chain, node_deviations
-
     factors, amplitudes, mean = motion._arrays
-
     attitudes, lows = np.empty((last + 1, 4)), np.zeros((last + 1, 4))
     attitudes[0] = motion.initial_attitude
     for first in range(0, last, _NODE_CHUNK):
