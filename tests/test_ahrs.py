@@ -588,6 +588,51 @@ def test_a_slow_turn_with_which_the_field_turns_is_no_rest(turn):
     assert turned == pytest.approx(180.0 * turn, abs=2.0)
 
 
+@functools.cache
+def in_a_swell(seed: int, duration: float = 300.0) -> Recording:
+    """A ship in waves of 0.05 to 0.15 Hz: roll 8°, pitch 4° and yaw 3°, acceleration 0.6, 0.6 and 1 m/s² RMS; gyro without bias."""
+    random = np.random.default_rng(seed)
+    w = 2.0 * np.pi * random.uniform(0.05, 0.15, (6, 6))
+    phase = random.uniform(0.0, 2.0 * np.pi, (6, 6))
+    size = np.sqrt(1.0 / 3.0) * np.array([3.0, 4.0, 8.0, 0.6, 0.6, 1.0])
+    time = np.arange(round(duration * RATE)) / RATE
+
+    def waves(time: np.ndarray) -> np.ndarray:
+        return size * np.sin(time[:, None, None] * w + phase).sum(axis=-1)
+
+    def attitude(time: np.ndarray) -> Rotation:
+        return Rotation.from_euler("ZYX", waves(time)[:, :3], degrees=True)
+
+    return measured(
+        "swell",
+        time,
+        attitude(time),
+        rates(time, attitude),
+        acceleration=waves(time)[:, 3:],
+        noise=(2e-3, 0.03, 0.4),
+        seed=seed,
+    )
+
+
+@pytest.mark.parametrize(("magnetometer", "most"), [(True, 0), (False, 3)])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_ship_in_waves_hardly_ever_rests(seed, magnetometer, most):
+    """A second in which the rate hardly changes is frequent; that vertical and field are fixed in it is a coincidence of all."""
+    ship = in_a_swell(seed)
+    ship = ship if magnetometer else dataclasses.replace(ship, magnetic_field=None, magnetic_unit="")
+    assert len(rests_of(ship).last) <= most
+
+
+def test_sigma_holds_on_a_ship_in_waves():
+    for seed in (1, 2, 3):
+        result = ahrs.estimate(in_a_swell(seed)).estimate
+        errors = reference_errors(result.attitude, in_a_swell(seed).true_attitude)
+        sigma = np.sqrt(result.variance[:, :3].sum(axis=1))
+        late = result.time > 20.0
+        assert np.mean(errors.total[late] < 2.0 * sigma[late]) > 0.9
+        assert np.mean(errors.total[late]) < 10.0 * DEGREE
+
+
 def test_after_a_first_rest_in_a_steady_turn_the_true_ones_are_used():
     assert rests_of(lying(40, 5.0 * DEGREE * (np.arange(400) < 200))).last[-1] == 399
 

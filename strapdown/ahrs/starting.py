@@ -29,6 +29,8 @@ MAX_REST_SIGMA = 1.0 * DEGREE
 """Maximum σ, rad/s, of the mean rate of a span as a measurement of the bias."""
 TURNING_RATE = 0.3 * DEGREE
 """Mean rate, rad/s, above which vertical and field are examined for a rotation with it."""
+CHANGE_BY_NOISE = 3e-3
+"""Change of the mean specific force or field, relative to it, from half to half of a span at rest."""
 TURN_ODDS = 5.0
 """Difference of a mean rate from the bias by the rests before, relative to its σ, above which it is a turn."""
 FIELD_TURN, FIELD_TIME = 0.5 * DEGREE, 15.0
@@ -295,6 +297,7 @@ def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constant
         walk=walk,
         unmodelled=walk - modelled,
         slow_walk=SLOW_DRIFT**2,
+        noise=CHANGE_BY_NOISE**2,
         field_turn=FIELD_TURN**2,
         field_time=FIELD_TIME,
     )

@@ -32,6 +32,8 @@ class Constants(NamedTuple):
     """Squared difference of a mean rate from the bias by the rests before, relative to its variance, above which it is a turn."""
     turning: float
     """Squared mean rate, (rad/s)², above which vertical and field are examined for a rotation with it."""
+    noise: float
+    """Squared change of specific force and field from half to half, relative to them, by noise at rest."""
     walk: float
     """Variance that the bias gains in a second between rests."""
     unmodelled: float
@@ -148,7 +150,8 @@ def find_rest(constants, time, memory):
 
     The variance of its mean rate is that of a unit at rest and the spread of the rate between the parts, which is motion of the hand. A
     span with a gap is no rest, nor one with which the vertical or the field rotates, nor one that is faster than a bias that the rests
-    before leave possible: a steady turn is no bias. Nor is a rate with which the field turns slowly.
+    before leave possible: a steady turn is no bias. Nor is a rate with which the field turns slowly. At rest the specific force hardly
+    changes; on waves it may turn against the rate.
     """
     parts, part = constants.parts, constants.part
     rate = (0.0, 0.0, 0.0)
@@ -169,14 +172,16 @@ def find_rest(constants, time, memory):
     changed = dot(change, change) > constants.odds * (variance + plausible)
     # Unless the new rate is less than half of that bias, which then was a turn itself.
     turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
-    with_force, square_force = turned_with(constants, rate, memory, 0)
-    with_field, square_field = turned_with(constants, rate, memory, 2)
+    with_force, square_force, change_force = turned_with(constants, rate, memory, 0)
+    with_field, square_field, _ = turned_with(constants, rate, memory, 2)
+    fixed = with_force <= 0.5 * square_force and with_field <= 0.5 * square_field + constants.noise
     quiet = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
         and 2.0 * covered > parts
         and not turns
-        and (dot(rate, rate) <= constants.turning or with_force + with_field <= 0.5 * (square_force + square_field))
+        and (dot(rate, rate) <= constants.turning or fixed)
+        and change_force <= 0.1 * square_force + constants.noise
     )
     if variance >= constants.max_variance:
         store_row(memory.field_before, 0, (0.0, 0.0, 0.0))
@@ -224,16 +229,16 @@ def turned_by(constants, rate, since, before, field):
 
 
 def turned_with(constants, rate, memory, first):
-    """Return c·w and w·w of the change c of a direction from the first to the second half, and that, w, by the mean rate."""
+    """Return c·w, w·w and c·c of the relative change c of a vector from the first to the second half, and that, w, by the mean rate."""
     sums, number = memory.halves, memory.halves_number
     in_first, in_second = number[first], number[first + 1]
     total = combine(1.0, vector_at(sums, first), 1.0, vector_at(sums, first + 1))
     size = math.sqrt(dot(total, total)) / max(in_first + in_second, 1)
-    product, square = 0.0, 0.0
+    product, square, squared_change = 0.0, 0.0, 0.0
     if in_first > 0 and in_second > 0 and size > 0.0:
         before, after = 1.0 / (size * in_first), 1.0 / (size * in_second)
         change = combine(after, vector_at(sums, first + 1), -before, vector_at(sums, first))
         middle = combine(before, vector_at(sums, first), after, vector_at(sums, first + 1))
         expected = cross(rate, combine(-0.25 * constants.span, middle, 0.0, middle))
-        product, square = dot(change, expected), dot(expected, expected)
-    return product, square
+        product, square, squared_change = dot(change, expected), dot(expected, expected), dot(change, change)
+    return product, square, squared_change
