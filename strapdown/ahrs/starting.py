@@ -60,6 +60,8 @@ MAX_DEVIATION = 0.1
 """Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
 SLOWEST_SWELL = 0.1
 """Frequency of the slowest acceleration that is distinguished from such a bias, Hz."""
+ONE_DIRECTION = 0.985
+"""Cosine of the angle, 10°, between two directions of the specific force that count as one."""
 MIN_LEVEL = 0.07
 """Squared cosine of the dip, 75°, beyond which a field has hardly a heading."""
 FIRST_HEADING = 0.1
@@ -363,9 +365,13 @@ def for_whole(recording: Recording, parameters: AhrsParameters, at_rest: Rests) 
         spans = recording.specific_force[np.add.outer(at_rest.last, np.arange(1 - parts * part, 1))]
         halves = [np.nanmean(half, axis=1) for half in np.array_split(spans, 2, axis=1)]
         first, second = (lengths(half) - STANDARD_GRAVITY for half in halves)
+        deviation, up = 0.5 * (first + second), (halves[0] + halves[1]) / lengths(halves[0] + halves[1])[:, None]
         # An acceleration of frequency f changes by π f of its amplitude from half to half of a second; a bias does not.
         by_motion = (second - first) ** 2 / (np.pi * SLOWEST_SWELL) ** 2
-        square = float(np.mean(0.25 * (first + second) ** 2 - by_motion))
+        # From rest to rest in one direction a bias does not change either.
+        change = np.diff(deviation)[np.sum(up[1:] * up[:-1], axis=1) > ONE_DIRECTION]
+        between = 0.5 * np.mean(change**2) if len(change) else 0.0
+        square = float(np.mean(deviation**2 - by_motion) - between)
         if square > MAX_DEVIATION**2:
             parameters = replace(parameters, accelerometer_bias_sigma=square**0.5)
     return parameters
