@@ -1130,6 +1130,35 @@ def test_without_a_magnetometer_heading_and_bias_are_scaled_by_what_has_not_show
     np.testing.assert_allclose(with_bias[1], both * with_bias[0], rtol=1e-6, atol=1e-12)
 
 
+def test_without_a_magnetometer_sigma_of_the_heading_includes_acceleration_taken_for_bias():
+    """A car, with the model of any motion: the heading errs by up to 69°."""
+    car = dataclasses.replace(driven(300.0), magnetic_field=None, magnetic_unit="")
+    result = ahrs.estimate(car, ahrs.of_motion("any", magnetometer=False), full_covariance=True).estimate
+    R = quaternion.to_matrix(result.attitude)
+    sigma = np.sqrt((R @ result.covariance[:, :3, :3] @ R.transpose(0, 2, 1))[:, 2, 2])
+    turned = quaternion.multiply(result.attitude, quaternion.conjugate(car.true_attitude))
+    error = 2.0 * np.arctan2(turned[:, 3], turned[:, 0])
+    error = np.abs((error - error[0] + np.pi) % (2.0 * np.pi) - np.pi)
+    assert error.max() > 60.0 * DEGREE
+    assert np.mean(error < 1.96 * sigma) > 0.9
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize(("density", "factor"), [(0.1, 1.0), (3.0, 4.0 * 3.0**1.25)])
+def test_without_a_magnetometer_heading_and_bias_follow_the_density_of_the_force(density, factor, smooth, monkeypatch):
+    monkeypatch.setattr(regions, "density", lambda filtered, *_, **__: np.full(len(filtered.time), density))
+    unit = dataclasses.replace(ahrs.HAND_HELD_WITHOUT_MAGNETOMETER, heading_scale=1.0)
+    turning = dataclasses.replace(recording(noise=1.0), magnetic_field=None)
+    result = ahrs.estimate(turning, unit, latency=0.0, smooth=smooth)
+    own = result.parameters.setup
+    blocks = own.states.blocks({series.sensor: series.kind for series in result.record.vectors})
+    run = estimation.smooth if smooth else estimation.run
+    plain = run(result.record, own.process_noise, result.initial, blocks)
+    rows = slice(0, np.argmax(result.recording.time[result.rests.last[0]] <= plain.time))  # before a rest
+    at = np.searchsorted(result.recording.time, plain.time[rows])
+    np.testing.assert_allclose(result.estimate.variance[at, 3:], factor * plain.variance[rows, 3:], rtol=1e-9)
+
+
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_accelerometers_own_error_is_part_of_the_tilts_sigma(smooth):
     """0.5 m/s² over gravity about both level axes, and nothing else."""
@@ -1316,7 +1345,9 @@ def test_scales_follow_the_density():
     """With its power 5/4; that of the heading up to a limit online, and that of all innovations without."""
     density = np.array([0.0, 1e-3, 0.3, 1.0, 50.0])
     tilt, heading = np.empty((2, len(density)))
-    constants = regions.scales_of(dataclasses.replace(ahrs.HAND_HELD, tilt_scale=7.0, heading_scale=2.0))
+    constants = regions.scales_of(
+        dataclasses.replace(ahrs.HAND_HELD, tilt_scale=7.0, heading_scale=2.0), magnetometer=True
+    )
     compiled(recording_steps.scale_factors)(
         read_only(density), read_only(density[::-1].copy()), constants, tilt, heading
     )

@@ -179,7 +179,7 @@ class LiveAhrs:
         arrays.alignment[:] = starting.alignment_memory(unknown=False)
         arrays.rate_change[0] = kernel.FIRST_RATE_CHANGE
         arrays.force_density[0] = regions.FIRST_DENSITY[0]
-        arrays.field_density[0] = regions.FIRST_DENSITY[0] if magnetometer else 1.0
+        arrays.field_density[0] = regions.FIRST_DENSITY[0]
         arrays.force_averages[:] = regions.first_memory(2, step)
         arrays.field_averages[:] = regions.first_memory(1, parameters.heading_interval)
         return arrays
@@ -188,7 +188,8 @@ class LiveAhrs:
         """Return the arguments of the kernels of a recording, for one step or one stamp."""
         parameters, a, r = self.parameters, imu.arrays, read_only
         of_force, of_field = map(regions.averages, (max(parameters.step, self.interval), parameters.heading_interval))
-        scales = regions.scales_of(parameters)
+        scales = regions.scales_of(parameters, magnetometer=self.magnetometer)
+        of_heading = a.field_density if self.magnetometer else a.force_density
         estimate = imu.attitude, imu.bias, imu.variance, imu.covariance
         at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
         stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
@@ -207,7 +208,7 @@ class LiveAhrs:
                 Aligned(a.aligned_force, a.aligned_field, a.aligned_variance),
             ),
             judge=(r(a.force_innovation), of_force, a.force_averages, a.force_density),
-            scale=(r(a.force_density), r(a.field_density), scales, a.tilt, a.heading),
+            scale=(r(a.force_density), r(of_heading), scales, a.tilt, a.heading),
             carry=(
                 at_step,
                 stamps,

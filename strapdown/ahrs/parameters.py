@@ -83,7 +83,7 @@ class AhrsParameters:
     tilt_scale, heading_scale : float, default 5.0, 3.5
         Reported variance of tilt and heading relative to that of the filter if the innovations of the accelerometer or of the magnetometer
         are white; in others it follows their spectral density at low frequency with the power 5/4 (:mod:`strapdown.ahrs.regions`). Without
-        a magnetometer ``heading_scale`` is the factor on the variances of heading and bias before anything has shown the bias.
+        a magnetometer ``heading_scale`` is the least factor on the variances of heading and bias before anything has shown the bias.
     gyro_scale_sigma : float, default 0.0
         σ of each entry of the gyro's matrix of scale factors and misalignments, dimensionless; 0: no states. Its symmetric part has
         states. The other part, a rotation relative to the accelerometer's axes, is zero for sensors on one chip.

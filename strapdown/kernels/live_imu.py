@@ -63,7 +63,7 @@ LASTING = {
     "iron_variance": ((1,), "", "variance that is added to that of the heading, rad^2"),
     "field": ((MOST, 3), "", "field at the samples of this step"),
     "field_innovation": ((1, 1), "", "last innovation of the heading over its sigma"),
-    "field_density": ((1,), "", "density of the heading's innovations at low frequency; 1 without a magnetometer"),
+    "field_density": ((1,), "", "density of the heading's innovations at low frequency"),
     "field_averages": ((4,), "", "its averages and sums"),
     "alignment": (
         (SIZE,),

@@ -195,7 +195,9 @@ class Limits(NamedTuple):
     accelerometer: float
     """Variance of the tilt by the accelerometer's own error, rad², in addition."""
     bias: float
-    """Initial variance of the gyro's bias, (rad/s)²: the factor applies to heading and bias by the share that is left; 0: with a field."""
+    """Initial variance of the gyro's bias, (rad/s)²; 0: with a field."""
+    unshown: float
+    """Least factor on σ of heading and bias without a field; it applies by the share of that variance that is left."""
 
 
 def limited(factor, variance, limit):
@@ -230,7 +232,7 @@ def carry_to_stamps(steps, stamps, limits, out):
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
         sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt)
         if limits.bias > 0.0:  # nothing but the gyro shows the heading, whose error is mainly that of the bias
-            h = b = limited(steps.heading[k], 3.0 * limits.bias, P[3, 3] + P[4, 4] + P[5, 5])
+            h = b = max(steps.heading[k], limited(limits.unshown, 3.0 * limits.bias, P[3, 3] + P[4, 4] + P[5, 5]))
         else:
             h, b = limited(steps.heading[k], zz, limits.heading), 1.0
         floor, iron = limits.accelerometer, steps.iron[k]
