@@ -796,6 +796,32 @@ def test_a_motion_that_does_not_suit_is_warned_of(motion, said, smooth):
     assert any("lasts longer than modelled" in remark for remark in estimate.remarks) == said
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_smoother_warns_of_a_ship_in_waves_as_a_hands_motion(seed):
+    """Its heading is up to 20° wrong at σ 5°; the online σ holds."""
+    with pytest.warns(ahrs.MotionWarning, match="(?s)lasts longer than modelled.*motion.*vessel"):
+        sd.smooth(in_a_swell(seed))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ahrs.MotionWarning)
+        sd.smooth(recording(60.0, noise=1.0))
+
+
+@pytest.mark.parametrize("frequency", [0.07, 0.5])
+def test_the_density_at_the_frequencies_of_waves(frequency):
+    """White innovations have 1; a sine of amplitude A the square of the two averages' difference at its frequency, in closed form."""
+    k = 100_000
+    white = np.random.default_rng(4).standard_normal((k, 2))
+    assert 1.0 < regions.swell_density(with_innovations(white, 4.0), INTERVAL) < 2.6  # the largest of 50 minutes
+    time, z = INTERVAL * np.arange(k), np.exp(-2j * np.pi * frequency * INTERVAL)
+    kept = np.exp(-INTERVAL / np.array([2.0, 4.0]))
+    gain = np.diff((1.0 - kept) / (1.0 - kept * z))[0]
+    lags = np.arange(10_000)
+    of_white = np.sum(np.diff((1.0 - kept) * kept ** lags[:, None]) ** 2)
+    sine = np.sin(2.0 * np.pi * frequency * time)[:, None] * [1.0, 1.0]
+    density = regions.swell_density(with_innovations(sine, 4.0), INTERVAL)
+    assert density == pytest.approx(0.5 * np.abs(gain) ** 2 / of_white, rel=0.05)
+
+
 def test_a_vibrating_machine_needs_no_set_of_its_own():
     """Vibration has hardly a velocity, so the filter of a hand bounds it; that of any motion takes most of it for tilt noise."""
     plain = recording(60.0, bias=(0.4 * DEGREE, -0.3 * DEGREE, 0.2 * DEGREE), noise=0.2)

@@ -79,6 +79,8 @@ class AhrsEstimate:
         Calibration of the unit by which the samples were corrected.
     force_density : float
         Largest spectral density at low frequency of the accelerometer's innovations so far, relative to that of white ones.
+    swell_density : float
+        The same at the frequencies of waves, over a minute; 0 if not smoothed.
     """
 
     recording: Recording
@@ -92,6 +94,7 @@ class AhrsEstimate:
     hard_iron: Array
     applied: UnitCalibration | None
     force_density: float
+    swell_density: float
 
     @property
     def calibration(self) -> UnitCalibration | None:
@@ -176,7 +179,8 @@ def estimate(
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, at_rest, options)
-    density = regions.density(filtered, "accelerometer", max(parameters.step, used.interval), causal=not smooth)
+    interval = max(parameters.step, used.interval)
+    density = regions.density(filtered, "accelerometer", interval, causal=not smooth)
     at_stamps = _at_stamps(filtered, density, used, prepared, parameters, delays, options)
     return AhrsEstimate(
         recording=samples,
@@ -190,6 +194,7 @@ def estimate(
         rests=at_rest,
         hard_iron=_iron_at_end(filtered, prepared),
         force_density=float(density.max()),
+        swell_density=regions.swell_density(filtered, interval) if smooth else 0.0,
     )
 
 

@@ -169,7 +169,7 @@ class LiveAhrs:
 
     def _first_arrays(self, step: float) -> Any:
         """Return the arrays of the samples before the first one."""
-        parameters, magnetometer = self.parameters, self.magnetometer
+        parameters = self.parameters
         most = MAX_SAMPLES_RATIO * max(1, math.ceil(parameters.step / self.interval)) + 2
         shapes = {
             name: ([most if n == kernel.MOST else n for n in shape], np.int64 if kind == "int" else float)

@@ -4,10 +4,10 @@ One model serves slow and fast motion, good and poor units, clean and disturbed 
 estimate that averages many measurements errs by the slow part of their errors: for innovations that are not white its variance follows
 their spectral density at low frequency. That of the accelerometer's level innovations scales the variance of the tilt, and that of the
 magnetometer the variance of the heading. Without a magnetometer the variances of heading and bias are scaled by as much of the bias as
-nothing has shown yet: of some phones it is many times the σ that gives the least error; or by the density of the accelerometer's innovations
-if that is more, because acceleration that lasts longer than modelled passes for a bias about the vertical. The scales were chosen so that the 95 % regions
-hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend on them. The factors apply to the
-variance of a settled filter.
+nothing has shown yet: of some phones it is many times the σ that gives the least error; or by the density of the accelerometer's
+innovations if that is more, because acceleration that lasts longer than modelled passes for a bias about the vertical. The scales were
+chosen so that the 95 % regions hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend on
+them. The factors apply to the variance of a settled filter.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ SCALE_WITHOUT_FIELD = 4.0
 """Factor on the variances of heading and bias without a magnetometer if the accelerometer's innovations are white. With it the regions of
 the heading hold 0.95 to 0.96 of the time in those of 94 recordings, without their magnetometers, whose density exceeds 1; before 0.70 to
 0.89."""
+SWELL_TIMES = 2.0, 4.0
+"""Time constants of the moving averages of innovations whose difference contains the frequencies of waves, 0.04 to 0.16 Hz, s."""
 FIRST_DENSITY = (0.3, 2.5)
 """Density assumed at first, and the time over which innovations weigh as much, s."""
 
@@ -107,6 +109,22 @@ def density(filtered: Estimate, sensor: str, interval: float, *, causal: bool) -
         return np.full(len(filtered.time), values[-1])
     row = np.searchsorted(innovations.time, filtered.time, side="right")
     return np.asarray(np.append(FIRST_DENSITY[0], values)[row])
+
+
+def swell_density(filtered: Estimate, interval: float) -> float:
+    """Return the largest mean over :data:`DENSITY_MEMORY` of the density of the accelerometer's level innovations at waves' frequencies.
+
+    It is relative to that of white innovations. ``interval``: that of the filter's steps, s.
+    """
+    innovations = filtered.innovations["accelerometer"]
+    level = np.ascontiguousarray((innovations.innovation / np.sqrt(innovations.variance))[:, :2])
+    level[~np.isfinite(level)] = 0.0
+    a, b = (-math.expm1(-interval / time) for time in SWELL_TIMES)
+    white = a / (2.0 - a) + b / (2.0 - b) - 2.0 * a * b / (1.0 - (1.0 - a) * (1.0 - b))
+    square = np.mean((low_pass(level, a) - low_pass(level, b)) ** 2, axis=1) / white
+    width = min(len(square), math.ceil(DENSITY_MEMORY / interval))
+    total = np.append(0.0, np.cumsum(square))
+    return float(np.max(total[width:] - total[:-width], initial=0.0)) / max(width, 1)
 
 
 def averages(interval: float) -> recording_steps.Averages:

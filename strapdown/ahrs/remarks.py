@@ -23,6 +23,10 @@ MAX_DENSITY = 20.0
 wrong; 88 recordings with a magnetometer have 14 at most, simulated cars, bicycles and aircraft as a hand's 28 to 1600. Without a
 magnetometer a large bias of the gyro does the same."""
 
+MAX_SWELL = 3.0
+"""The same of the smoother at the frequencies of waves (:func:`strapdown.ahrs.regions.swell_density`): 88 recordings have 1.8 at most,
+simulated ships in waves as a hand's 4.5 to 11. The filter's σ holds on these."""
+
 MAGNETIC_NORTH = "East-North-Up, magnetic North"
 """Fixed frame of an estimate with a magnetometer."""
 
@@ -39,7 +43,8 @@ def warn(result: AhrsEstimate, motion: str) -> None:
 
 def misfit(result: AhrsEstimate, motion: str) -> str:
     """Return why the model of a motion does not suit the recording; empty: nothing shows that."""
-    if result.recording.magnetic_field is not None and result.force_density > MAX_DENSITY:
+    swell = 0.0 if motion == "any" else result.swell_density  # any motion may be that of waves
+    if result.recording.magnetic_field is not None and (result.force_density > MAX_DENSITY or swell > MAX_SWELL):
         shown = "its acceleration lasts longer than modelled"
     elif (departure := _departure(result)) > MAX_DEPARTURE:
         shown = f"between rests the gyro's bias is estimated to change by up to {departure / DEGREE:.2g} deg/s, as no gyro's does"
@@ -48,6 +53,8 @@ def misfit(result: AhrsEstimate, motion: str) -> str:
     words = f"The motion model ({motion}) does not suit: {shown}. Errors may exceed their σ."
     if motion != "vehicle":
         words += f" Acceleration that lasts for seconds is that of a vehicle ({Hint('motion', 'vehicle')})."
+    if motion != "vessel":
+        words += f" On waves it is that of a vessel ({Hint('motion', 'vessel')})."
     return words
 
 
