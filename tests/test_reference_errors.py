@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from strapdown.checks import InputError
-from strapdown.consistency import reference_errors
+from strapdown.consistency import ReferenceErrors, reference_errors
 from strapdown.consistency.accuracy import accuracy
 from strapdown.records import Estimate, Truth
 
@@ -59,19 +59,38 @@ def test_errors_are_of_the_fixed_frame():
     np.testing.assert_allclose([errors.heading[0], errors.inclination[0]], [0.0, 0.1], atol=1e-15)
 
 
-def test_missing_references_give_nan():
+def test_missing_references_give_nan_and_are_not_judged():
     estimate, reference = (scalar_first(r) for r in random_pairs(6))
     reference[[1, 4]] = np.nan
     reference[2, 3] = np.nan
     errors = reference_errors(estimate, reference)
     np.testing.assert_array_equal(np.isnan(errors.total), [False, True, True, False, True, False])
     np.testing.assert_array_equal(np.isnan(errors.heading), np.isnan(errors.inclination))
+    assert np.isfinite(list(errors.rms().values())).all()
 
 
 def test_single_precision_references_are_taken():
     estimate, reference = (scalar_first(r) for r in random_pairs(10))
     rough = reference_errors(estimate, reference.astype(np.float32))
     np.testing.assert_allclose(rough.total, reference_errors(estimate, reference).total, atol=1e-6)
+
+
+def test_rms_over_the_movement():
+    errors = ReferenceErrors(
+        total=np.array([5.0, 3.0, 4.0, np.nan]),
+        heading=np.array([0.0, 1.0, 7.0, np.nan]),
+        inclination=np.array([1.0, 2.0, 2.0, np.nan]),
+    )
+    moving = np.array([False, True, True, True])
+    np.testing.assert_allclose(list(errors.rms(moving).values()), [np.sqrt(12.5), 5.0, 2.0], rtol=1e-15)
+    assert list(errors.rms(moving)) == ["total", "heading", "inclination"]
+    assert errors.rms()["total"] == pytest.approx(np.sqrt(50.0 / 3.0), rel=1e-15)
+
+
+def test_nothing_to_judge_is_said():
+    errors = ReferenceErrors(total=np.array([np.nan, 1.0]), heading=np.zeros(2), inclination=np.zeros(2))
+    with pytest.raises(InputError, match=r"no sample to judge .* movement mask"):
+        errors.rms(np.array([True, False]))
 
 
 def test_the_accuracy_over_the_movement_is_that_of_its_rows():

@@ -39,6 +39,15 @@ class ReferenceErrors(NamedTuple):
     inclination: Array
     """Angle of the remaining rotation, between the two verticals (n,)."""
 
+    def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
+        """Return the RMS of each error, rad, over the samples with a reference; if given, only those of the ``movement`` mask."""
+        judged = np.isfinite(self.total) if movement is None else np.isfinite(self.total) & movement
+        if not judged.any():
+            raise InputError(
+                "no sample to judge has a valid reference attitude; check the movement mask and the reference"
+            )
+        return {kind: float(np.sqrt(np.mean(getattr(self, kind)[judged] ** 2))) for kind in KINDS}
+
 
 def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErrors:
     """Return the attitude errors against a reference whose fixed frame has its z axis vertical.

@@ -182,7 +182,7 @@ def _need_whole_groups(source: str, header: Sequence[Column], roles: Mapping[str
         missing = [role for role in members if role not in roles]
         if group == "gyro" and missing and {"qw", "qx", "qy", "qz"} <= {column.name.lower() for column in header}:
             raise InputError(
-                f"{source} has attitudes and no gyro; read it by `sd.read_attitudes`, or `strapdown check --truth`"
+                f"{source} has attitudes and no gyro; read it by `sd.read_attitudes`, or check it with {Hint('truth')}"
             )
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
             raise InputError(
