@@ -42,7 +42,7 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
     """
     noise, bias_sigma = filter_setup.process_noise, filter_setup.bias_sigma
     try:
-        if filter_setup.states is None:
+        if filter_setup.states is None or not filter_setup.states.sensors:
             state = estimation.first_state(record, noise, bias_sigma=bias_sigma)
         else:
             rough = replace(record, vectors=tuple(series.noise_scaled(ROUGH) for series in record.vectors))
