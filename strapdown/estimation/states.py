@@ -223,12 +223,16 @@ PRIOR_INFLATION = 10.0
 
 
 def first_state(
-    record: ImuRecord, process_noise: ProcessNoise, *, bias_sigma: float, bias: ArrayLike = (0.0, 0.0, 0.0)
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    *,
+    bias_sigma: float,
+    bias: ArrayLike = (0.0, 0.0, 0.0),
+    inflation: float = PRIOR_INFLATION,
 ) -> State:
     """Return a state at the first edge from the first measurements: a measured attitude, or two or more directions (Wahba's problem).
 
-    Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias. The σ of
-    the attitude is multiplied by ``PRIOR_INFLATION``, because the filter processes the same measurements again.
+    Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias.
 
     Parameters
     ----------
@@ -240,6 +244,8 @@ def first_state(
         Standard deviation of the bias error, rad/s, per axis.
     bias : array_like (3,), default zero
         Gyro bias, rad/s, body axes.
+    inflation : float, default 10
+        Factor on the σ of the attitude, because the filter processes the same measurements again.
 
     Returns
     -------
@@ -267,7 +273,7 @@ def first_state(
             problem = problem if k else error
             continue
         whole = np.zeros((6, 6))
-        whole[:3, :3] = PRIOR_INFLATION**2 * P
+        whole[:3, :3] = inflation**2 * P
         whole[3:, 3:] = bias_sigma**2 * np.eye(3)
         return State(attitude=attitude, bias=b, covariance=whole)
     raise type(problem)(f"the first measurements do not give the attitude: {problem}; give the initial attitude")

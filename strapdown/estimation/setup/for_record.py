@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,15 +41,17 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
     the attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
     (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where its hypotheses are merged into one.
     """
-    noise, bias_sigma = filter_setup.process_noise, filter_setup.bias_sigma
+    first_state = partial(
+        estimation.first_state, process_noise=filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma
+    )
+    inflation = PRIOR_INFLATION
     try:
         if filter_setup.states is None or not filter_setup.states.sensors:
-            state = estimation.first_state(record, noise, bias_sigma=bias_sigma)
+            state = first_state(record)
         else:
             rough = replace(record, vectors=tuple(series.noise_scaled(ROUGH) for series in record.vectors))
-            state = estimation.first_state(rough, noise, bias_sigma=bias_sigma)
-            with_errors = _with_sensor_errors(record, filter_setup, state)
-            state = estimation.first_state(with_errors, noise, bias_sigma=bias_sigma)
+            inflation = ERRORS_INFLATION
+            state = first_state(_with_sensor_errors(record, filter_setup, first_state(rough)), inflation=inflation)
     except InconsistentError as error:
         problem = _without_remedy(error)
         # With a sensor's errors among the states, the filter can estimate them.
@@ -61,12 +64,15 @@ def start(record: ImuRecord, filter_setup: FilterSetup) -> Start:
         return _by_multiple_models(
             record, filter_setup, _without_remedy(error), "One direction at a time does not determine the attitude"
         )
-    again = f"with {PRIOR_INFLATION:g} times their σ, since the filter uses them again"
+    again = f"with {inflation:g} times their σ, since the filter uses them again"
     return Start(state, f"Started from the first measurements {again}: σ {_sigma_words(state)}.")
 
 
 ROUGH = 10.0
 """Factor on the σ of measurements whose sensors have errors that are states, for an attitude that shows how large these may be."""
+ERRORS_INFLATION = 3.0
+"""Factor on σ of an attitude with such errors: the variance after the filter's first update is too small by a tenth, while with a larger
+factor the first update would be far from linear."""
 KNOWN = 1e-12
 """Share of the variances of attitude and bias of a filter whose innovations show the errors of the sensors only."""
 MIN_SAMPLES = 200
