@@ -292,9 +292,11 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all():
     assert (coverage.of, coverage.value) == ("bias y", 0.82)
     assert coverage.p_value == pytest.approx(36 * least, rel=1e-9)
     assert "82 % of the bias y errors lie within 1 σ" in coverage.means
+    assert coverage.at == f"within 1σ, worst at {few.time[6]:g} s"
 
 
 def test_few_runs_cannot_tell():
+    assert "not testable from 1 run:" in statistics_of(runs=1).judge().reason
     few = statistics_of(runs=2)
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
     assert starved.judge().verdict == "cannot tell"
@@ -318,6 +320,8 @@ def test_runs_that_failed_are_not_consistent():
     judged = replace(good, finite=finite).judge()
     assert judged.verdict == "not consistent"
     assert "1 of 200 runs failed" in judged.words
+    assert "optimistic" not in judged.words
+    assert judged.reason.startswith("the filter failed")
 
 
 def test_bounds_are_those_that_decide():

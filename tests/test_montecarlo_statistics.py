@@ -292,6 +292,8 @@ def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
         pytest.approx(student.statistic.max()),
     )
     assert findings["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
+    worst = epochs[student.statistic.argmax() // 6]
+    assert findings["mean error"].at == f"worst at {sums.time[worst]:g} s"
     anees = sums.nees_sum[epochs, 2]
     each = [2.0 * min(scipy.stats.chi2.cdf(value, 24), scipy.stats.chi2.sf(value, 24)) for value in anees]
     assert findings["ANEES"].p_value == pytest.approx(min(1.0, 2.0 * min(each)))

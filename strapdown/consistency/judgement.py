@@ -55,6 +55,7 @@ _LEANINGS = {
     frozenset({True, False}): "the filter's σ are too small in part and too large in part",
 }
 """Reason by whether the ratios that contradict the filter are greater than 1."""
+_FAILED = "the filter failed: an error is not finite, or a covariance is not finite and positive definite"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -522,7 +523,8 @@ def _verdict(
     """Return verdict and reason."""
     rejected = [finding for finding in findings if finding.rejected]
     if rejected:
-        leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
+        ratios = [finding.value for finding in rejected if finding.is_ratio]
+        leaning = _LEANINGS[frozenset(value > 1.0 for value in ratios)] if np.isfinite(ratios).all() else _FAILED
         contradict = "contradicts" if len(rejected) == 1 else "contradict"
         return "not consistent", f"{leaning}; {len(rejected)} of {len(findings)} tests {contradict} it"
     if not findings:

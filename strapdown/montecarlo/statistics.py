@@ -235,7 +235,7 @@ class Statistics(ByValue, Listed):
             parts=dict.fromkeys(parts, ""),
             required=detectable_error,
             unmodelled=() if self.plan is None else self.plan.unmodelled,
-            runs=f"{self.runs} runs",
+            runs=f"{self.runs} run{'s' if self.runs > 1 else ''}",
         )
         if not (what := _odd_runs(self)):
             return judged
@@ -482,7 +482,7 @@ def _anees(statistics: Statistics, epochs: Counts, subset: str, probability: flo
         at=f"mean {figure(float(verdict.mean.mean()))}, worst at {statistics.time[epochs[worst]]:g} s",
         means=error_words(f"the {subset} error at its worst epoch", value)
         if failed == 0
-        else f"{failed} of {statistics.runs} runs failed: their {subset} error or covariance is not finite",
+        else f"{failed} of {statistics.runs} runs failed: the NEES of their {subset} is not finite",
     )
 
 
@@ -512,13 +512,15 @@ def _mean_error(statistics: Statistics, epochs: Counts) -> Finding:
     mean = statistics.error_sum[epochs, :states] / runs
     square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2)[:, :states] / runs
     t = np.abs(mean) / np.sqrt(np.maximum(square - mean**2, 1e-300) / (runs - 1))
-    name = state_name(int(np.argmax(t.max(axis=0))))
+    epoch, state = np.unravel_index(int(np.argmax(t)), t.shape)
+    name = state_name(int(state))
     return Finding(
         name="mean error",
         of=name,
         value=float(t.max()),
         p_value=min(1.0, t.size * 2.0 * float(stdtr(runs - 1, -t.max()))),
         samples=runs,
+        at=f"worst at {statistics.time[epochs[epoch]]:g} s",
         means=f"the mean {name} error over the runs is not zero ({t.max():.3g} times its standard error): it does not average out",
     )
 
@@ -528,7 +530,7 @@ def _run_coverage(statistics: Statistics, epochs: Counts) -> Finding:
     inside = statistics.coverage[epochs, : 6 if statistics.has_bias else 3] / statistics.runs
     p = coverage_p_values(inside, statistics.runs)
     worst = np.unravel_index(int(np.argmin(p)), p.shape)
-    (_, state, k), value = map(int, worst), float(inside[worst])
+    (epoch, state, k), value = map(int, worst), float(inside[worst])
     name = state_name(state)
     return Finding(
         name="coverage",
@@ -536,6 +538,7 @@ def _run_coverage(statistics: Statistics, epochs: Counts) -> Finding:
         value=value,
         p_value=min(1.0, p.size * float(p.min())),
         samples=statistics.runs,
+        at=f"within {k + 1}σ, worst at {statistics.time[epochs[epoch]]:g} s",
         means=f"{100.0 * value:.3g} % of the {name} errors lie within {k + 1} σ at the worst epoch",
     )
 
