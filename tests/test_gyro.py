@@ -380,6 +380,7 @@ def test_low_pass_white_noise_is_stationary_and_keeps_the_random_walk_of_the_ang
 @given(st.lists(st.floats(1e-12, 1e3), min_size=8, max_size=8), st.booleans())
 def test_a_table_holds_the_specification_to_the_last_bit(values, by_axis):
     a, b, c, d, e, f, g, h = values
+    p, q, r, s, t, u, _, _ = (1e-3 * value for value in values)  # ratios are at most 1
     spec = GyroSpec(
         angle_random_walk=np.array([a, b, c]) if by_axis else a,
         rate_random_walk=b,
@@ -389,8 +390,8 @@ def test_a_table_holds_the_specification_to_the_last_bit(values, by_axis):
         markov_noise=f,
         markov_correlation_time=g,
         turn_on_bias=[a, -b, c],
-        scale_factor=[d, e, -f],
-        misalignment=[[0.0, a, b], [c, 0.0, d], [e, f, 0.0]],
+        scale_factor=[s, t, -u],
+        misalignment=[[0.0, p, q], [r, 0.0, s], [t, u, 0.0]],
         g_sensitivity=np.full((3, 3), h),
         range=h,
         drop_probability=a / (1.0 + a) * 0.9,
@@ -442,6 +443,8 @@ REFUSED = [
         ("angle_random_walk", -1.0), ("bias_instability", [1.0, -1.0, 0.0]), ("misalignment", np.eye(3)), ("bandwidth", 0.0),
         ("drop_probability", 1.0), ("scale_factor", [1.0]), ("markov_correlation_time", -3.0), ("timestamp_offset", np.nan),
     )),
+    (GyroSpec, {"scale_factor": -300.0}, r"scale_factor is up to 300.*is it in ppm"),
+    (GyroSpec, {"misalignment": 5.0 * (1.0 - np.eye(3))}, r"misalignment is up to 5 .*is it in mrad"),
     (gyro.from_table, {"table": {"bandwith_hz": 3.0}}, "did you mean 'bandwidth_hz'"),
     (gyro.from_table, {"table": {"range_deg_per_s": 3.0, "range_rad_per_s": 3.0}}, "second time"),
     (gyro.from_table, {"table": {"range_deg_per_s": "3 deg/s"}}, "unit is in the key"),

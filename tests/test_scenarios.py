@@ -40,6 +40,12 @@ def test_what_is_no_sensor_is_refused(value):
         dataclasses.replace(load_scenario("two-stars"), sensors=value)
 
 
+def test_one_sensor_is_given_as_a_tuple():
+    one = load_scenario("cubesat").sensors[0]
+    with pytest.raises(InputError, match=r"^sensors is AttitudeSensor\(.*\); give a tuple"):
+        dataclasses.replace(load_scenario("cubesat"), sensors=one)
+
+
 @pytest.mark.parametrize("value", ["slew", motion.Coning])
 def test_what_is_no_motion_is_refused(value):
     with pytest.raises(InputError, match=r"^motion is .*(slew|Coning).*; give a motion, such as motion\.rest"):

@@ -359,6 +359,8 @@ COMPASS = {"name": "compass", "sigma": 1e-7, "rate": 1.0}
 headings = vectors.VectorMeasurements.from_headings
 REFUSED = (
     (VectorSensor, STAR | {"sigma": -1.0}, "star: sigma is -1 rad"),
+    (VectorSensor, STAR | {"sigma": 20.0}, r"star: sigma is 20 rad.*is it in degrees"),
+    (AttitudeSensor, TRACKER | {"sigma_about": 60.0}, r"tracker: sigma_about is 60 rad.*is it in degrees"),
     (VectorSensor, STAR | {"reference_f": [0.0, 0.0, 0.0]}, "star: reference_f is the zero vector"),
     (VectorSensor, STAR | {"kind": "attitude"}, "star: kind 'attitude' is not known"),
     *((functools.partial(dataclasses.replace, sensor), {"rate": 0.0}, f"{sensor.name}: rate is 0 Hz") for sensor in EVERY),

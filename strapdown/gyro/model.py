@@ -133,6 +133,9 @@ class GyroSpec(ByValue):
             fields[name] = array(name, getattr(self, name), (3, 3))
         if np.any(np.diag(fields["misalignment"]) != 0.0):
             raise InputError("misalignment has entries on its diagonal; give those as scale_factor")
+        for name, unit in (("scale_factor", "ppm"), ("asymmetry", "ppm"), ("misalignment", "mrad")):
+            if (largest := np.max(np.abs(fields[name]))) > 1.0:
+                raise InputError(f"{name} is up to {largest:g} and must not be above 1 (is it in {unit}?)")
         for name, unit in (("markov_correlation_time", "s"), ("bandwidth", "Hz"), ("range", "rad/s")):
             value = float(getattr(self, name))
             fields[name] = value if value == np.inf else positive(name, value, unit=unit)

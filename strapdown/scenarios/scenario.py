@@ -122,6 +122,8 @@ class Scenario(ByValue):
         instance("gyro", self.gyro, GyroSpec, "give the specification of a gyro")
         if isinstance(self.motion, type) or not hasattr(self.motion, "increments"):
             raise InputError(f"motion is {self.motion!r}; give a motion, such as motion.rest() or motion.Coning(…)")
+        if not np.iterable(self.sensors):
+            raise InputError(f"sensors is {self.sensors!r}; give a tuple, also of one sensor: (sensor,)")
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         for sensor in self.sensors:

@@ -95,7 +95,7 @@ class Accelerometer(Sampled):
     kind: Kind = "direction"
 
     def __post_init__(self) -> None:
-        self._check_sampling(self.sigma, "m/s²")
+        self._check_sampling("m/s²", sigma=self.sigma)
         one_of(f"{self.name}: kind", self.kind, ("direction", "vector"))
         for name in ("lever_arm_b", "bias", "gravity_f"):
             object.__setattr__(self, name, array(f"{self.name}: {name}", getattr(self, name), (3,)))

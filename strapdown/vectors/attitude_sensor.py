@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, non_negative, one_of
+from strapdown.checks import Array, one_of
 from strapdown.vectors.measurements import direction
 from strapdown.vectors.sensor import Sampled, attitude_of
 
@@ -43,8 +43,7 @@ class AttitudeSensor(Sampled):
     boresight: str | tuple[float, ...] = "z"
 
     def __post_init__(self) -> None:
-        self._check_sampling(self.sigma_across, "rad")
-        non_negative(f"{self.name}: sigma_about", self.sigma_about, unit="rad")
+        self._check_sampling("rad", sigma_across=self.sigma_across, sigma_about=self.sigma_about)
         object.__setattr__(self, "boresight", _boresight(f"{self.name}: boresight", self.boresight))
 
     @property

@@ -33,7 +33,7 @@ class HeadingPair(Sampled):
     sigma: float
 
     def __post_init__(self) -> None:
-        self._check_sampling(self.sigma, "m")
+        self._check_sampling("m", sigma=self.sigma)
         object.__setattr__(self, "baseline_b", array(f"{self.name}: baseline_b", self.baseline_b, (3,)))
         direction(f"{self.name}: baseline_b", self.baseline_b)
 

@@ -34,7 +34,7 @@ class HorizonSensor(Sampled):
     def __post_init__(self) -> None:
         from strapdown.motion.orbit import CircularOrbit  # imports all motions, which recordings do not need
 
-        self._check_sampling(self.sigma, "rad")
+        self._check_sampling("rad", sigma=self.sigma)
         instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:

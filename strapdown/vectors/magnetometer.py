@@ -41,7 +41,7 @@ class Magnetometer(Sampled):
     kind: Kind = "direction"
 
     def __post_init__(self) -> None:
-        self._check_sampling(self.sigma, "T")
+        self._check_sampling("T", sigma=self.sigma)
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
         if not callable(self.field_f):
             object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -158,9 +159,11 @@ class Sampled(ByValue):
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 
-    def _check_sampling(self, sigma: float, unit: str) -> None:
-        """Refuse a negative noise, rate or phase."""
-        non_negative(f"{self.name}: sigma", sigma, unit=unit)
+    def _check_sampling(self, unit: str, **sigmas: float) -> None:
+        """Refuse a negative noise, rate or phase, and a noise of more than half a turn."""
+        for name, sigma in sigmas.items():
+            if non_negative(f"{self.name}: {name}", sigma, unit=unit) > math.pi and unit == "rad":
+                raise InputError(f"{self.name}: {name} is {sigma:g} rad; it must not be above π (is it in degrees?)")
         positive(f"{self.name}: rate", self.rate, unit="Hz")
         non_negative(f"{self.name}: phase", self.phase, unit="s")
 

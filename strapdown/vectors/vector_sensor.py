@@ -56,7 +56,7 @@ class VectorSensor(Sampled):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference_f", direction(f"{self.name}: reference_f", self.reference_f))
-        self._check_sampling(self.sigma, "rad")
+        self._check_sampling("rad", sigma=self.sigma)
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
