@@ -131,7 +131,7 @@ def draw(result, path):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/simulate_imu"))
-    parser.add_argument("--preset", default="stim300", help="name of a gyro's datasheet")
+    parser.add_argument("--preset", choices=datasheets.PRESETS, default="stim300", help="gyro")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     outcome = main(**vars(arguments))

@@ -291,7 +291,7 @@ TABLE = [
     (tabled_sensor, {"velocity_sigma_m_s": 0.3}, "'velocity_sigma_m_per_s'"),
     (States, {"sensors": {"mag": {}}}, "must be SensorStates"),
     (lambda: States(gyro_scale_sigma=1.0).select(("gyro.scael",)), {}, "'gyro.scale'"),
-    (lambda: States().select(("gyro.scale",)), {}, "no states are declared"),
+    (lambda: States().select(("gyro.scale",)), {}, "scale_factor_ppm"),
     (
         lambda: States(
             sensors={"a": SensorStates(velocity_time=1.0, velocity_sigma=1.0, acceleration_time=1.0)}

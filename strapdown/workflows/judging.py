@@ -73,7 +73,9 @@ def check(
     if statistics is None:
         raise InputError("the Monte Carlo has no finished run yet; resume it")
     if not isinstance(statistics, Statistics):
-        raise InputError(f"result is {type(result).__name__}; give an Estimate, or the result of monte_carlo")
+        raise InputError(
+            f"result is {type(result).__name__}; give an Estimate (of a record: that of `estimate`), or the result of a Monte Carlo"
+        )
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
     return statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)

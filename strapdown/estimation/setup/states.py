@@ -285,7 +285,10 @@ class States(ByValue):
         """
         for name in names:
             if not self.names:
-                raise InputError(f"states: {name!r} is requested, but no states are declared; leave it out")
+                raise InputError(
+                    f"states: {name!r} is requested, but no error with a state is specified; specify its size in the scenario, "
+                    "such as scale_factor_ppm in [gyro], or leave it out"
+                )
             one_of("states: name", name, self.names)
         sensors = {sensor: _kept(states, sensor, _SENSOR_PARTS, names) for sensor, states in self.sensors.items()}
         used = {sensor: states for sensor, states in sensors.items() if states._blocks(sensor, "direction", 1.0)}
