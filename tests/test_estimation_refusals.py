@@ -27,6 +27,7 @@ SERIES = series_of("s", "direction", [0.5], [X], X, 0.1)
 RECORD = resting(SERIES)
 SETUP = FilterSetup(process_noise=NOISE, bias_sigma=1e-5)
 SENSOR = VectorSensor(name="up", reference_f=UP, sigma=1e-2, rate=10.0)
+TRACKER = VectorMeasurements(sensor="tracker", kind="attitude", time=[0.5], attitude=[IDENTITY], sigma_axes=[[1e-3] * 3])
 HUGE = 10**400
 
 
@@ -270,6 +271,8 @@ TABLE = [
     (live, {"sensors": [replace(SENSOR, name="gyro")]}, "named 'gyro'"),
     (live, {"sensors": [SERIES.taken(slice(0))]}, "the series is empty"),
     (lambda: live([SENSOR]).update(1e12, (0.0, 0.0, 0.1)), {}, "time is that of the initial state"),
+    (lambda: live([TRACKER]).update(0.1, (0.0, 0.0, 0.1), tracker=(2.0, 0.0, 0.0, 0.0)), {}, "tracker has norm 2"),
+    (lambda: live([TRACKER]).update(0.1, (0.0, 0.0, 0.1), tracker=(1.0, 0.0, 0.0)), {}, "wanted (4,)"),
     # Setups and their tables.
     (tabled, {"gyro_scale_sigma_pmm": 1.0}, "'gyro_scale_sigma_ppm'"),
     (tabled, {"gyro_scale_sigma_ppm": [1.0, 2.0]}, "gyro_scale_sigma has shape (2,)"),

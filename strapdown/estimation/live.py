@@ -301,6 +301,8 @@ class LiveFilter:
                 at += kernel.STRIDE
         except KeyError:
             one_of("sensor", name, self._sensors)
+        except InputError:  # of a quaternion
+            raise
         except (TypeError, ValueError, OverflowError):
             raise InputError(
                 f"{name} is {sample!r}; give {'one number' if name == 'time' else 'three numbers'}"
@@ -586,7 +588,5 @@ def _row(series: VectorMeasurements, place: int) -> list[float]:
 
 def _quaternion(name: str, value: Any) -> list[float]:
     """Return a measured quaternion; NaN if it is missing."""
-    q = np.asarray(value, np.float64)
-    if q.shape == (4,) and np.isnan(q).any():
-        return [math.nan] * 4
-    return list(unit_quaternions(name, array(name, q, (4,))).tolist())
+    q = array(name, value, (4,), allow_nan=True)
+    return [math.nan] * 4 if np.isnan(q).any() else list(unit_quaternions(name, q).tolist())
