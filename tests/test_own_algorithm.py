@@ -152,6 +152,7 @@ def test_every_command_takes_a_file_for_a_name():
         ('name = "x"\nfollowing = 1\ncoefficients = ["2/3"]', "and following 0"),
         ('name = "x"\nprevious = 2\ncoefficients = ["2/3"]', "make samples 0"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 1, 0.5]]', "two different increments"),
+        ('name = "x"\nsamples = 3\nproducts = [[1, 2, 0.5], [1, 2, 0.7]]', r"products\[1\] is of Δθ_1 × Δθ_2 again"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 3, 0.5]]', "increments of 1 … 2"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 2]]', r"give \(i, j, K\)"),
         ('name = "x"\nproducts = [[1, 2, 0.5]]', "samples is None"),
