@@ -537,6 +537,12 @@ def test_a_sparser_truth_is_taken_at_its_own_times(replayed):
         np.testing.assert_array_equal(checked(replayed, **off).estimate.covariance, replayed.estimate.covariance[every])
 
 
+def test_times_in_another_unit_are_reported(replayed):
+    remark = checked(replayed, time=1e2 * replayed.estimate.time, align="none").remarks[0]
+    assert "times in common; check the unit of time" in remark
+    assert not any("unit of time" in words for words in checked(replayed).remarks)
+
+
 def test_what_is_asked_for_is_removed(replayed):
     turned = quaternion.multiply(HEADING, replayed.estimate.attitude)
     outcome = checked(replayed, attitude=turned, align="fixed", error_frame="body")

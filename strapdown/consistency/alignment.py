@@ -184,7 +184,7 @@ def at_common_times(own: Series, theirs: Series, offset: float) -> tuple[Series,
         raise InputError(
             f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
             f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have fewer than two times in common; "
-            f"give both of one clock, or {Hint('align', 'time')}"
+            f"give both of one clock in one unit, or {Hint('align', 'time')}"
         )
     bias = np.full((len(q), 3), np.nan) if bias is None else bias
     truth = Truth(attitude=q, bias=bias, movement=movement).taken(good)

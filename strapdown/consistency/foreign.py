@@ -46,6 +46,8 @@ ERROR_FRAMES = ("body", "fixed", "euler")
 poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
+FEW_IN_COMMON = 0.05
+"""Share of the times of the shorter history below which the unit of time is doubted."""
 SCALE = "σ wrong by one factor"
 CLOCK = "offset of the clock, delay"
 NO_BIAS = "gyro bias held at zero"
@@ -187,6 +189,12 @@ def check_attitudes(
     remarks: list[str] = []
     whole, alignment = align_series(whole, theirs, _wanted(align), remarks)
     common, true = at_common_times(whole, theirs, alignment.offset)
+    if len(common.time) < FEW_IN_COMMON * min(len(whole.time), len(theirs.time)):
+        lasts, last = np.ptp(whole.time), np.ptp(theirs.time)
+        remarks.append(
+            f"the estimate lasts {lasts:.4g} s and the truth {last:.4g} s, with only {len(common.time)} times in common; "
+            "check the unit of time"
+        )
     remarks += alignment.words
     aligned = in_truth_frames(common.attitude, alignment)
     frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
