@@ -27,7 +27,9 @@ SERIES = series_of("s", "direction", [0.5], [X], X, 0.1)
 RECORD = resting(SERIES)
 SETUP = FilterSetup(process_noise=NOISE, bias_sigma=1e-5)
 SENSOR = VectorSensor(name="up", reference_f=UP, sigma=1e-2, rate=10.0)
-TRACKER = VectorMeasurements(sensor="tracker", kind="attitude", time=[0.5], attitude=[IDENTITY], sigma_axes=[[1e-3] * 3])
+TRACKER = VectorMeasurements(
+    sensor="tracker", kind="attitude", time=[0.5], attitude=[IDENTITY], sigma_axes=[[1e-3] * 3]
+)
 HUGE = 10**400
 
 

@@ -261,7 +261,9 @@ def _pair_table(place: str, products: Sequence[Any], window: int) -> Table:
         if i == j or max(i, j) > window:
             raise InputError(f"{here} is of Δθ_{i} × Δθ_{j}; give two different increments of 1 … {window}")
         if table[i - 1][j - 1]:
-            raise InputError(f"{here} is of Δθ_{i} × Δθ_{j} again; give the product of two increments once, with the sum")
+            raise InputError(
+                f"{here} is of Δθ_{i} × Δθ_{j} again; give the product of two increments once, with the sum"
+            )
         (value,) = _rationals(here, entry[2:])
         table[i - 1][j - 1], table[j - 1][i - 1] = value, -value
     return tuple(map(tuple, table))
