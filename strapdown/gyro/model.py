@@ -61,7 +61,7 @@ class GyroSpec(ByValue):
     turn_on_bias_sigma : float or ndarray (3,), default 0.0
         Standard deviation of a constant bias drawn in every run, rad/s.
     scale_factor : ndarray (3,), default zeros
-        Scale-factor errors, dimensionless: the diagonal of M.
+        Scale-factor errors, dimensionless: the diagonal of M in the measured rate (I + M) w_b.
     asymmetry : ndarray (3,), default zeros
         Scale-factor asymmetry a, dimensionless: adds ``a |w|``, so that the scale factor is 1 + s ± a by the sign of the rate.
     misalignment : ndarray (3, 3), default zeros
