@@ -295,8 +295,12 @@ def test_check_refuses_the_truth_of_another_record():
     for other in (sd.check, sd.diagnose, sd.accuracy):
         with pytest.raises(sd.InputError, match="record is of seed 7, run 0, and the estimate of seed 3"):
             other(estimate, sd.simulate(scenario(10.0), seed=7))
+        faulty = dataclasses.replace(scenario(10.0).gyro, scale_factor=1e-3)
+        with pytest.raises(sd.InputError, match="another scenario"):
+            other(estimate, sd.simulate(dataclasses.replace(scenario(10.0), gyro=faulty)))
+    slower = sd.simulate(dataclasses.replace(scenario(10.0), rate=40.0, duration=5.0))
     with pytest.raises(sd.InputError, match="stamps"):
-        sd.check(estimate, sd.simulate(dataclasses.replace(scenario(10.0), rate=40.0, duration=5.0)))
+        sd.check(estimate, dataclasses.replace(slower, origin=None))
     with pytest.raises(sd.InputError, match="epochs"):
         sd.check(estimate, sd.simulate(scenario(5.0)).truth)
 

@@ -164,11 +164,17 @@ def test_damaged_results_are_no_verdict(folder, tmp_path, file, name, change, co
     assert complaint in refused([command, path])
 
 
-def test_causes_are_sought_in_the_record_that_was_estimated(folder, tmp_path):
-    result = CliRunner().invoke(cli.app, ["simulate", "magnetometer-only", "--out", str(tmp_path / "other.h5")])
-    assert result.exit_code == 0
-    said = refused(["check", folder / "run" / "estimate.h5", "--record", tmp_path / "other.h5"])
-    assert "made from another record" in said
+def test_causes_are_sought_in_the_record_that_was_estimated(folder, short, tmp_path):
+    held = recordfiles.read_record(folder / "record.h5")
+    others = {
+        "made from another record": scenarios.simulate(
+            scenarios.load_scenario("magnetometer-only"), seed=held.origin.seed
+        ),
+        "the record is of seed 8": scenarios.simulate(short, seed=8),
+    }
+    for complaint, other in others.items():
+        recordfiles.write_record(tmp_path / "other.h5", other)
+        assert complaint in refused(["check", folder / "run" / "estimate.h5", "--record", tmp_path / "other.h5"])
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -49,6 +49,7 @@ def check(
     and frames are compared first. Without a truth, an estimate of another program is judged by its innovations, if it has any.
     """
     from strapdown.recordings.recordfiles import read_record
+    from strapdown.workflows.judging import need_same_draw
 
     how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     # A missing file is reported as one of this package.
@@ -69,6 +70,7 @@ def check(
             held = replace(held, setup=sd.estimation.setup.read_setup(filter_file))
         if record is not None:  # whose specification is that of the estimate, or replaces it
             source = read_record(record)
+            need_same_draw(held, source)
             held = replace(held, origin=source.origin or held.origin)
         with reading.from_file(result):
             judgement = sd.check(held, **how)

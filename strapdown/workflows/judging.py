@@ -118,7 +118,7 @@ def diagnose(
     if unknown or not np.isin(result.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
         raise InputError(f"the record {what}; the estimate was made from another record")
-    _need_same_draw(result, record)
+    need_same_draw(result, record)
     if filter_setup.states is not None and filter_setup.states.names:
         names = ", ".join(filter_setup.states.names)
         return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
@@ -165,12 +165,15 @@ def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes 
     return accuracy_of(own, Series(truth.seconds(result.epoch_ns), truth.attitude, movement=truth.movement))
 
 
-def _need_same_draw(result: Estimate, record: ImuRecord) -> None:
-    """Raise an error for a simulated record of another seed or run than that of the estimate; their time stamps are the same."""
+def need_same_draw(result: Estimate, record: ImuRecord) -> None:
+    """Raise an error for a simulated record of another seed, run or scenario than the estimate's; their time stamps may be the same."""
     origins = [origin for origin in (record.origin, result.origin) if origin is not None and origin.seed is not None]
     drawn = [f"of seed {origin.seed}, run {origin.run}" for origin in origins]
     if len(set(drawn)) > 1:
         raise InputError(f"the record is {drawn[0]}, and the estimate {drawn[1]}; give the record of the estimate")
+    scenarios = [origin.scenario for origin in origins if origin.scenario is not None]
+    if len(scenarios) > 1 and scenarios[0] != scenarios[1]:
+        raise InputError("the record is of another scenario; the estimate was made from another record")
 
 
 def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> Truth | None:
@@ -190,7 +193,7 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
         "truth", truth, (ImuRecord, Recording), "give the record, the recording, or a Truth at the estimate's epochs"
     )
     if isinstance(truth, ImuRecord):
-        _need_same_draw(result, truth)
+        need_same_draw(result, truth)
     rows, same = matched(truth.time, result.time, SAME_STAMP)
     if not same.all():
         raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
