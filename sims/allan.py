@@ -1,6 +1,6 @@
 """What noise does a gyro at rest have? Simulate a record, draw its Allan deviation, fit the coefficients, compare with the truth.
 
-The fitted coefficients must agree with the simulated specification within their intervals. Run ``python sims/allan.py``; ``--study``
+Nineteen of twenty 95 % intervals should contain the coefficient of the simulated specification. Run ``python sims/allan.py``; ``--study``
 repeats it over 400 axes for records of several durations and gyros of several random walks (two minutes), counts how often the intervals
 contain the truth, and compares the errors with the standard errors of the fits.
 """
