@@ -7,7 +7,7 @@ import pytest
 from measured import FIELD, HAND
 from two_stars import BELIEVED, FREE, case, drawn_case, scenario
 
-from strapdown import covariance, gyro, tuning, vectors
+from strapdown import covariance, gyro, tuning, vectors, workflows
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.setup.states import SensorStates, States
@@ -62,6 +62,7 @@ TABLE = [
     (free, ("filter.scale", "gyro.arw"), {}, "tune it alone"),
     (free, FREE, {"filter_setup": STEADY}, "gyro.rrw starts from 0"),
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
+    (workflows.tune, (ONE.record,), {"setup": replace(BELIEVED, sigma={"star": 1e-4})}, "sigma: sensor 'star'"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
     (tuning.error_objective, ([ONE, ATTITUDE_ALONE], BELIEVED, FREE), {}, "on records of one kind"),
     (tuning.recording_case, (BARE,), {}, "bare has no accelerometer samples"),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from strapdown import ahrs
-from strapdown.checks import Hint, InputError, count, instance
+from strapdown.checks import Hint, InputError, count, instance, one_of
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
@@ -159,6 +159,8 @@ def _cases(
         need_angles(setup, record)
         cases.append(tuning.record_case(source, setup, name=label) if isinstance(source, ImuRecord) else source)
     assert setup is not None
+    for name in setup.sigma if own else ():
+        one_of("sigma: sensor", name, {series.sensor for case in cases for series in case.record.vectors})
     return setup, cases, remarks
 
 
