@@ -63,6 +63,7 @@ TABLE = [
     (free, FREE, {"filter_setup": STEADY}, "gyro.rrw starts from 0"),
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
     (workflows.tune, (ONE.record,), {"setup": replace(BELIEVED, sigma={"star": 1e-4})}, "sigma: sensor 'star'"),
+    (workflows.tune, ([ONE.record, ONE.record],), {"setup": BELIEVED}, "a record is given twice"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),
     (tuning.error_objective, ([ONE, ATTITUDE_ALONE], BELIEVED, FREE), {}, "on records of one kind"),
     (tuning.recording_case, (BARE,), {}, "bare has no accelerometer samples"),

@@ -124,6 +124,8 @@ def _by_name(sources: Source | Sequence[Source] | Mapping[str, Source]) -> Mappi
         sources = {f"record {k}" if len(listed) > 1 else "": source for k, source in enumerate(listed)}
     if not sources:
         raise InputError("sources is empty; give at least one record or recording")
+    if len({id(source) for source in sources.values()}) < len(sources):
+        raise InputError("sources: a record is given twice, which would halve the variances; give each record once")
     for source in sources.values():
         instance("sources", source, (ImuRecord, Recording, Case), SOURCE)
         if isinstance(source, Recording):
