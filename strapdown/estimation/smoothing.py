@@ -197,7 +197,7 @@ def _smoothed(problem: Problem, options: Options, kind: type[_SixStates | _ManyS
         problem = _part(problem, since, last, _candidate(problem, options, state, memory, since))
         begin, passed = since, filtered_whole(problem, options)
     rows = outputs if passed is whole else kind(problem).outputs(len(problem.record.time), options)
-    kind(problem).go_back(passed.segments, segment_starts(problem, passed.segments), 0, rows)
+    kind(problem).go_back(passed.segments, segment_starts(problem, passed.segments), rows)
     if passed is not whole:
         write(problem, rows)
     return whole, outputs
@@ -291,11 +291,8 @@ class _SixStates:
             covariance=covariance.reshape(-1, 6, 6) if options.full_covariance else None,
         )
 
-    def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:
-        """Smooth from the filtered state at the last stop back to stop ``first``, and write all rows between.
-
-        ``starts``: index of the segment that starts at each stop.
-        """
+    def go_back(self, segments: Array, starts: np.ndarray, outputs: Sequence[Array]) -> None:
+        """Smooth from the filtered state at the last edge back to the first; ``starts``: index of the segment that starts at each edge."""
         if segments.shape[1] > 32:  # of a filter with a gate: the triangle of P by rows, not its blocks
             order = covariance_blocks(_places())
             segments = np.concatenate([segments[:, :11], segments[:, 11 + order]], axis=1)
@@ -305,7 +302,6 @@ class _SixStates:
         compiled(smoother_loop.smooth_back)(
             segments.reshape(-1),
             starts,
-            first,
             *self.problem.variances,
             np.empty(smoother_loop.WORK_SIZE),
             smoother_loop.Outputs(*outputs),
@@ -338,11 +334,8 @@ class _ManyStates:
         x, variance, P = outputs
         return forward.estimate_of(self.problem, 1, x, variance, P if options.full_covariance else None)
 
-    def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:
-        """Smooth from the filtered state at the last stop back to stop ``first``, and write all rows between.
-
-        ``starts``: index of the segment that starts at each stop.
-        """
+    def go_back(self, segments: Array, starts: np.ndarray, outputs: Sequence[Array]) -> None:
+        """Smooth from the filtered state at the last edge back to the first; ``starts``: index of the segment that starts at each edge."""
         # The same for all sensors.
         without = self.problem.model.structure._replace(sensors=())
         kernels = forward.instance_of(replace(self.problem.model, structure=without), smoother)
@@ -364,7 +357,7 @@ class _ManyStates:
         )
         space = smoother.Workspace._make((*states, *matrices, *others, noisy))
         models = smoother.Models(model, _with_negative_noise(model))
-        compiled(kernels.smooth_back)(segments, starts, first, models, space, smoother.Outputs(*outputs))
+        compiled(kernels.smooth_back)(segments, starts, models, space, smoother.Outputs(*outputs))
 
 
 def _with_negative_noise(model: structure.Model) -> structure.Model:

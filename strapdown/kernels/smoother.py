@@ -282,8 +282,8 @@ def correct_filtered(x, error, later_x, later_P):
     put_attitude(later_x, later_P, q, new_q)
 
 
-def smooth_back(segments, starts, first, models, space, out):
-    """Go back from the filtered state at the last edge to edge ``first``, and write all between.
+def smooth_back(segments, starts, models, space, out):
+    """Smooth from the filtered state at the last edge back to the first, and write all edges.
 
     Parameters
     ----------
@@ -291,7 +291,6 @@ def smooth_back(segments, starts, first, models, space, out):
         The filter's predictions, the last row the end state.
     starts : array (edges,)
         Row that starts at each edge.
-    first : int
     models : Models
     space : Workspace
     out : Outputs
@@ -303,10 +302,10 @@ def smooth_back(segments, starts, first, models, space, out):
     load_segment(segments, s, space.later_x, space.later_P, width)
     mirror(space.later_P, n, width)
     while True:
-        while edge >= first and starts[edge] == s:
+        while edge >= 0 and starts[edge] == s:
             write_smoothed(out, edge, space.later_x, space.later_P, n, width)
             edge -= 1
-        if edge < first:
+        if edge < 0:
             break
         s -= 1
         step_back(segments, s, models, space)

@@ -405,8 +405,8 @@ class Outputs(NamedTuple):
     """By rows (edges, 36), or (0, 36)."""
 
 
-def smooth_back(segments, starts, first, angle_variance, rate_variance, work, out):
-    """Smooth from the last edge back to edge ``first``, and write the results of all edges.
+def smooth_back(segments, starts, angle_variance, rate_variance, work, out):
+    """Smooth from the filtered state at the last edge back to the first, and write all edges.
 
     ``segments`` holds the filter's rows (dt, increment, state at the start), flat, at least ``FEWEST_ROWS``, with the end state in the
     last; ``starts[k]`` is the row that starts at edge k. ``work`` has ``WORK_SIZE`` numbers.
@@ -421,12 +421,12 @@ def smooth_back(segments, starts, first, angle_variance, rate_variance, work, ou
     q, b, A, B, C = load_state(segments[ROW * j + 4 : ROW * j + 4 + SIZE])
     keep_state(out, k, q, b, A, B, C)
     k -= 1
-    if k < first:
+    if k < 0:
         return
     # Group t ends t groups before this row; the last starts with row 0 and may overlap the one before it.
     end = len(segments) // ROW - 1
     top = (end - j) // w
-    bottom = (end - 1 - starts[first]) // w
+    bottom = (end - 1 - starts[0]) // w
     count, group, place = 0, GROUPS, GROUPS
     # Each iteration prepares a group, propagates errors over the previous one, and covariances over the one before that.
     for n in range(top, bottom + 3):
@@ -471,7 +471,7 @@ def smooth_back(segments, starts, first, angle_variance, rate_variance, work, ou
             begin = max(end - w * t, 0)
             if starts[k] >= begin:
                 move_states(work, group_before, errors_before, len(out.covariance) > 0)
-                while k >= first and starts[k] >= begin:
+                while k >= 0 and starts[k] >= begin:
                     write_smoothed(work, starts[k] - begin, k, out)
                     k -= 1
         if top <= t <= bottom:
