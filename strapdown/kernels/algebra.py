@@ -80,6 +80,11 @@ def transpose(A):
     return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
 
 
+def symmetric_index(i, j):
+    """Return the index of element (i, j) of a symmetric matrix in its 6-tuple."""
+    return (0, 1, 2, 1, 3, 4, 2, 4, 5)[3 * i + j]
+
+
 def full(S):
     """Return a symmetric matrix as a 9-tuple."""
     return (S[0], S[1], S[2], S[1], S[3], S[4], S[2], S[4], S[5])

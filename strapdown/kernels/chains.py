@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from strapdown.kernels.algebra import congruent, multiply
+from strapdown.kernels.algebra import congruent, multiply, symmetric_index
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, sum_lanes
 
 CALLED = ("chain_step", "fill_coefficients")
@@ -88,30 +88,17 @@ def fill_coefficients(coefficients, dt, model):
         for i in range(SET):
             coefficients[here + i] = 0.0
         for j in range(first, k + 1):
-            (a, b, c), Q = chain_step(decay, chains, j, first, dt)
-            row = 2 - (k - j)
-            if row == 2:
-                coefficients[here + 2], coefficients[here + 4], coefficients[here + 5] = a, b, c
-            if row == 1:
-                coefficients[here + 1], coefficients[here + 3] = b, c
-            if row == 0:
-                coefficients[here] = c
+            column, Q = chain_step(decay, chains, j, first, dt)
+            place = 2 - (k - j)  # of state j in the set
             # Each state of a chain may be driven; its noise reaches the states before it.
             q = chains[j, 1]
-            if q != 0.0:
-                if row == 2:
-                    coefficients[here + 6] += q * Q[0]
-                    coefficients[here + 7] += q * Q[1]
-                    coefficients[here + 8] += q * Q[2]
-                    coefficients[here + 9] += q * Q[3]
-                    coefficients[here + 10] += q * Q[4]
-                    coefficients[here + 11] += q * Q[5]
-                if row == 1:
-                    coefficients[here + 6] += q * Q[3]
-                    coefficients[here + 7] += q * Q[4]
-                    coefficients[here + 9] += q * Q[5]
-                if row == 0:
-                    coefficients[here + 6] += q * Q[5]
+            for a in range(place + 1):
+                coefficients[here + symmetric_index(a, place)] = column[2 - place + a]
+                for b in range(a, place + 1):
+                    if q != 0.0:
+                        coefficients[here + 6 + symmetric_index(a, b)] += (
+                            q * Q[symmetric_index(2 - place + a, 2 - place + b)]
+                        )
         rate = decay[k]
         coefficients[here + MEAN] = -math.expm1(-rate * dt) / rate if rate > 0.0 else dt
 

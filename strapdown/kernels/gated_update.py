@@ -342,8 +342,7 @@ def store_correction(body, rows, u, M, q, now_q):
     for j in range(N):
         work[step + j] = 0.0
         for r in range(rows):
-            w = u[0] if r == 0 else (u[1] if r == 1 else u[2])
-            work[step + j] += w * work[LINE * (FACTORS + r) + j]
+            work[step + j] += u[r] * work[LINE * (FACTORS + r) + j]
     work[step], work[step + 1], work[step + 2] = matrix_times_vector(M, (work[step], work[step + 1], work[step + 2]))
     rotate_vectors(work, step, fixed_turn(q, now_q))
     for j in range(N):
@@ -376,12 +375,7 @@ def correct(body, i, rows, e, variance):
     work, x, P = body.work, body.x, body.P[i]
     clear_step(work, 0.0)
     for r in range(rows):
-        value, noise = e[0], variance[0]
-        if r == 1:
-            value, noise = e[1], variance[1]
-        if r == 2:
-            value, noise = e[2], variance[2]
-        take_row(P, work, PRIOR_ROWS + r, value, noise, 0.0)
+        take_row(P, work, PRIOR_ROWS + r, e[r], variance[r], 0.0)
     step = LINE * STEP
     for j in range(3, N):
         x[i, 1 + j] += work[step + j]

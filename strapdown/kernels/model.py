@@ -16,6 +16,7 @@ from strapdown.kernels.algebra import (
     multiply,
     scale,
     skew_polynomial,
+    symmetric_index,
     symmetric_minus_outer,
     transpose_times_vector,
 )
@@ -262,7 +263,7 @@ def noise_formula(x, Q, delta, dt, model, coefficients, like):
     q11, q12, q22, cross_noise = step_noise(phi, D, dt, model, like)
     for a in AXES:
         for d in AXES[a:]:
-            put_element(Q, a, d, q11[index_of_3x3(a, d)])
+            put_element(Q, a, d, q11[symmetric_index(a, d)])
         for j in AXES:
             put_element(Q, a, 3 + j, q12[3 * a + j])
         put_element(Q, 3 + a, 3 + a, q22)
@@ -305,7 +306,7 @@ def propagate_with(x, P, rotation, noise, dt, model, coefficients, like):
             s = products(t[:3], phi11[3 * d : 3 * d + 3])
             s = s + products(rate, phi12[3 * d : 3 * d + 3])
             s = plus(s, products(in_attitude, tuple(e[d] for _, e in attitude_effects)))
-            put_element(P, a, d, plus(s, q11[index_of_3x3(a, d)]))
+            put_element(P, a, d, plus(s, q11[symmetric_index(a, d)]))
         for j in OTHERS:
             if j not in CHAINED:
                 if j < 6:
@@ -400,22 +401,17 @@ def chain_matrix(coefficients, g, size):
     """Return Φ of a chain by rows."""
     first = 3 - size
     return tuple(
-        tuple(parameter(coefficients, SET * g + index_of_3x3(i, j)) if j >= i else 0 for j in range(first, 3))
+        tuple(parameter(coefficients, SET * g + symmetric_index(i, j)) if j >= i else 0 for j in range(first, 3))
         for i in range(first, 3)
     )
 
 
 def chain_noise(coefficients, g, size, i, d):
     """Return Q[i, d] of a chain."""
-    return parameter(coefficients, SET * g + 6 + index_of_3x3(i + 3 - size, d + 3 - size))
+    return parameter(coefficients, SET * g + 6 + symmetric_index(i + 3 - size, d + 3 - size))
 
 
 def rate_and_density(model, g):
     """Return λ and the PSD of the driving noise of the last state of chain g."""
     k = model.last[g]
     return parameter(model.decay, k), parameter(model.chains, 2 * k + 1) if PARAMETERS else model.chains[k, 1]
-
-
-def index_of_3x3(i, j):
-    """Return the index of an element of a symmetric matrix in its 6-tuple."""
-    return (0, 1, 2, 1, 3, 4, 2, 4, 5)[3 * i + j]
