@@ -18,7 +18,7 @@ import numpy as np
 from strapdown.kernels.algebra import dot, symmetric_times_vector
 from strapdown.kernels.chains import fill_coefficients
 from strapdown.kernels.filter_step import transition
-from strapdown.kernels.layout import LINES, PRODUCT, ROWS
+from strapdown.kernels.layout import LINE, PRODUCT, RESIDUAL, ROWS, VARIANCE, N, W
 from strapdown.kernels.measurement import HEADING, KIND, Measurements, six_at, vector_at
 from strapdown.kernels.model import advance, apply_transition, write_transition
 from strapdown.kernels.rows import write_rows
@@ -182,7 +182,7 @@ def predict(state, part, dt, body, out):
     for c in range(len(body.noises.source)):
         for a in range(3):
             transform(body.noises.cross[c, a], body)
-    columns, width = body.columns, len(top) // 3
+    columns = body.columns
     for k in range(len(columns.value)):
         value = columns.value[k]
         transform(value, body)
@@ -192,7 +192,7 @@ def predict(state, part, dt, body, out):
             if place >= 0:
                 rate += columns.rate[state.edge - 1, place, a]
             for i in range(3):
-                value[i] += top[width * i + 3 + a] * rate
+                value[i] += top[W * i + 3 + a] * rate
             value[3 + a] += dt * ramp[a]
     advance(x, filters.P[0], part, dt, filters.model, filters.coefficients, 0.0)
     return state
@@ -218,43 +218,41 @@ def propagate_source(s, part, dt, body):
         x[i] = body.filter.x[0, i]
     advance(x, P, part, dt, model, body.coefficients, 0.0)
     _, phi12 = transition(part, dt)
-    width = len(body.top) // 3
     for a in range(3):
         u, v = angle[a] - least_angle, rate[a] - least_rate
         if u + v > 0.0:
             for i in range(3):
                 column = -phi12[3 * i + a] / dt
                 for j in range(3):
-                    P[width * i + j] += (u * dt + v * dt**3 / 3.0) * column * (-phi12[3 * j + a] / dt)
-                P[width * i + 3 + a] -= 0.5 * dt * dt * v * column
-                P[width * (3 + a) + i] -= 0.5 * dt * dt * v * column
-            P[width * (3 + a) + 3 + a] += v * dt
+                    P[W * i + j] += (u * dt + v * dt**3 / 3.0) * column * (-phi12[3 * j + a] / dt)
+                P[W * i + 3 + a] -= 0.5 * dt * dt * v * column
+                P[W * (3 + a) + i] -= 0.5 * dt * dt * v * column
+            P[W * (3 + a) + 3 + a] += v * dt
 
 
 def propagate_rate(c, body):
     """Add the contribution of a coloured rate that is constant over the step, and propagate its covariance with the error."""
-    rates, top = body.rates, body.top
-    P, width, n = body.sources.P[rates.source[c]], len(body.top) // 3, len(body.x) - 1
+    rates, top, P = body.rates, body.top, body.sources.P[body.rates.source[c]]
     for a in range(3):
         power = 0.0
-        for i in range(n):
+        for i in range(N):
             body.error[i] = 0.0
         for m in range(rates.gains.shape[1]):
             cross = rates.cross[c, a, m]
             transform(cross, body)
-            for i in range(n):
+            for i in range(N):
                 body.error[i] += rates.gains[c, m] * cross[i]
             drive = rates.amplitude[c, a] ** 2 * rates.power[c, m]
             power += rates.gains[c, m] * drive
             for i in range(3):
-                cross[i] += top[width * i + 3 + a] * drive
+                cross[i] += top[W * i + 3 + a] * drive
         for i in range(3):
-            body.error[i] += 0.5 * power * top[width * i + 3 + a]
-        for i in range(n):
+            body.error[i] += 0.5 * power * top[W * i + 3 + a]
+        for i in range(N):
             for j in range(3):
-                t = body.error[i] * top[width * j + 3 + a]
-                P[width * i + j] += t
-                P[width * j + i] += t
+                t = body.error[i] * top[W * j + 3 + a]
+                P[W * i + j] += t
+                P[W * j + i] += t
 
 
 # ------------------------------------------------------------------------------------------------------------------------------- update
@@ -269,18 +267,17 @@ def put_rows(shape, filters, measured, e):
 def update(state, e, now, measured, body, out):
     """Correct the filter's covariance and every source by a measurement."""
     filters, noises, columns, nis = body.filter, body.noises, body.columns, out.nis
-    work, n = filters.work, len(body.x) - 1
-    line, sensor = len(work) // LINES, measured.sensor[e]
+    work, sensor = filters.work, measured.sensor[e]
     shape = filters.shape[sensor]
     # w by central differences, in which the residuals are linear.
     weights = body.weights
     for a in range(3):
         put_rows(shape, filters, body.shifted[2 * a], e)
         for r in range(3):
-            weights[0, r, a] = work[line * (ROWS + r) + n]
+            weights[0, r, a] = work[LINE * (ROWS + r) + RESIDUAL]
         put_rows(shape, filters, body.shifted[2 * a + 1], e)
         for r in range(3):
-            weights[0, r, a] = (weights[0, r, a] - work[line * (ROWS + r) + n]) * (0.5 / body.shift)
+            weights[0, r, a] = (weights[0, r, a] - work[LINE * (ROWS + r) + RESIDUAL]) * (0.5 / body.shift)
     rows, valid = put_rows(shape, filters, measured, e)
     if not valid:
         return state
@@ -289,17 +286,17 @@ def update(state, e, now, measured, body, out):
     clear_step(work, 0.0)
     noise = six_at(body.noise, e)
     for r in range(rows):
-        h = line * (ROWS + r)
-        out.residual[e, r] = work[h + n]
-        _, innovation = take_row(filters.P[0], work, ROWS + r, 0.0, work[h + n + 1], 0.0)
-        k = work[line * PRODUCT : line * PRODUCT + n]
+        h = LINE * (ROWS + r)
+        out.residual[e, r] = work[h + RESIDUAL]
+        _, innovation = take_row(filters.P[0], work, ROWS + r, 0.0, work[h + VARIANCE], 0.0)
+        k = work[LINE * PRODUCT : LINE * PRODUCT + N]
         expected = 0.0
         for s in range(len(body.sources.P)):
-            expected += correct_source(s, r, sensor, work[h : h + n], k, noise, body)
+            expected += correct_source(s, r, sensor, work[h : h + N], k, noise, body)
         for c in range(len(body.rates.source)):
             for a in range(3):
                 for m in range(body.rates.gains.shape[1]):
-                    correct_vector(body.rates.cross[c, a, m], work, h, k, 0.0, n)
+                    correct_vector(body.rates.cross[c, a, m], work, h, k, 0.0)
         mean = 0.0
         for i in range(len(columns.value)):
             error = 0.0
@@ -307,7 +304,7 @@ def update(state, e, now, measured, body, out):
                 error = out.residual[e, r]
             for a in range(3):
                 error += work[h + a] * columns.turn[e, i, a] + weights[0, r, a] * columns.offset[e, i, a]
-            shift = correct_vector(columns.value[i], work, h, k, error, n)
+            shift = correct_vector(columns.value[i], work, h, k, error)
             if i < columns.fixed:
                 mean += shift
             else:
@@ -342,11 +339,11 @@ def begin_noises(noises, sensor, now):
                     noises.cross[c, a, i] *= decay
 
 
-def correct_vector(value, work, h, k, error, n):
+def correct_vector(value, work, h, k, error):
     """Replace an error by ``value − k (h value + error)``; return the number in brackets."""
-    for i in range(n):
+    for i in range(N):
         error += work[h + i] * value[i]
-    for i in range(n):
+    for i in range(N):
         value[i] -= k[i] * error
     return error
 
@@ -358,36 +355,35 @@ def correct_source(s, r, sensor, h, k, noise, body):
     error and the noise, V that of the noise. The product is by its left and then its right factor, each of which may reduce P by far.
     """
     noises, P, p, g = body.noises, body.sources.P[s], body.product, body.error
-    n, width = len(body.x) - 1, len(body.top) // 3
     variance = 0.0
-    for i in range(n):
+    for i in range(N):
         g[i] = 0.0
         p[i] = 0.0
-        for j in range(n):
-            p[i] += P[width * i + j] * h[j]
+        for j in range(N):
+            p[i] += P[W * i + j] * h[j]
         variance += h[i] * p[i]
-    for i in range(n):
-        for j in range(n):
-            P[width * i + j] -= k[i] * p[j]
-    for i in range(n):
+    for i in range(N):
+        for j in range(N):
+            P[W * i + j] -= k[i] * p[j]
+    for i in range(N):
         p[i] = 0.0
-        for j in range(n):
-            p[i] += P[width * i + j] * h[j]
+        for j in range(N):
+            p[i] += P[W * i + j] * h[j]
     for c in range(len(noises.source)):
         if noises.source[c] == s:
             variance += correct_noise(c, r, sensor, h, k, noise, body)
-    for i in range(n):
-        for j in range(i, n):
-            upper, lower = P[width * i + j] - p[i] * k[j], P[width * j + i] - p[j] * k[i]
+    for i in range(N):
+        for j in range(i, N):
+            upper, lower = P[W * i + j] - p[i] * k[j], P[W * j + i] - p[j] * k[i]
             value = 0.5 * (upper + lower) - (g[i] * k[j] + k[i] * g[j])
-            P[width * i + j] = value
-            P[width * j + i] = value
+            P[W * i + j] = value
+            P[W * j + i] = value
     return variance
 
 
 def correct_noise(c, r, sensor, h, k, noise, body):
     """Correct the covariance of a noise and the error by a row; add to g, and return the noise's part of the innovation's variance."""
-    noises, g, n = body.noises, body.error, len(body.x) - 1
+    noises, g = body.noises, body.error
     white = noises.sigma[c] == 0.0
     w = (0.0, 0.0, 0.0)
     if noises.sensor[c] == sensor:
@@ -395,15 +391,15 @@ def correct_noise(c, r, sensor, h, k, noise, body):
     square = noises.sigma[c] * noises.sigma[c]
     Vw = symmetric_times_vector(noise if white else (square, 0.0, 0.0, square, 0.0, square), w)
     variance = dot(w, Vw)
-    for i in range(n):
+    for i in range(N):
         g[i] -= 0.5 * variance * k[i]
     for a in range(3):
         X = noises.cross[c, a]
         projected = 0.0
-        for i in range(n):
+        for i in range(N):
             projected += h[i] * X[i]
         variance += 2.0 * w[a] * projected
-        for i in range(n):
+        for i in range(N):
             X[i] -= k[i] * projected
             g[i] += w[a] * X[i]
             X[i] -= k[i] * Vw[a]
@@ -448,10 +444,10 @@ def whole(error, a, offsets):
 
 def write_whole(P, body, out):
     """Write the covariance of attitude and whole bias."""
-    n, width, offsets = len(body.x) - 1, len(body.top) // 3, body.filter.offsets
+    offsets = body.filter.offsets
     for b in range(6):
-        for i in range(n):
-            body.error[i] = whole(P[width * i : width * i + n], b, offsets)
+        for i in range(N):
+            body.error[i] = whole(P[W * i : W * i + N], b, offsets)
         for a in range(6):
             out[a, b] = whole(body.error, a, offsets)
 

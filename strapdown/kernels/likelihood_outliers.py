@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
-from strapdown.kernels.layout import LINES, PRIOR, ROWS, STEP
+from strapdown.kernels.layout import LINE, PRIOR, RESIDUAL, ROWS, STEP, VARIANCE, N, copy_values, put_at, value_at
 from strapdown.kernels.likelihood import WIDE, WORK, deviance_of
 from strapdown.kernels.rows import write_rows
 from strapdown.kernels.update import apply_step, clear_step, take_row
@@ -32,15 +32,12 @@ def counted(e, span, measured, body, out):
     """Update all lanes with both noises, continue with the mixture, and add to the sums."""
     f, room, like = body.filters, body.room, broadcast(0.0)
     x, P, Q, work = f.x[0], f.P[0], f.P[1], f.work
-    line = len(work) // LINES
     rows, _, _ = write_rows(f.shape[measured.sensor[e]], x, f, measured, e, like)
-    for i in range(0, len(P), WIDTH):
-        store(Q, i, load(P, i))
-    size = len(x) - WIDTH
-    taken(Q, work, rows, line, size, load(body.outliers, WIDTH), room, WIDE)
-    for i in range(0, size, WIDTH):
-        store(work, line * PRIOR + i, load(work, line * STEP + i))
-    noise = taken(P, work, rows, line, size, broadcast(1.0), room, 0)
+    copy_values(P, Q, N * (N + 1) // 2, like)
+    update_rows(Q, work, rows, load(body.outliers, WIDTH), room, WIDE)
+    for i in range(N):
+        put_at(work, LINE * PRIOR + i, value_at(work, LINE * STEP + i, like))
+    noise = update_rows(P, work, rows, broadcast(1.0), room, 0)
     if len(out.probability) > 0:
         store(room, WORK, noise)
         out.probability[e, 1] = room[WORK] / rows
@@ -48,21 +45,22 @@ def counted(e, span, measured, body, out):
     w = load(room, 0)
     if len(out.probability) > 0:
         out.probability[e, 0] = room[0]
-    for i in range(0, size, WIDTH):
-        d = load(work, line * PRIOR + i) - load(work, line * STEP + i)
-        store(work, line * PRIOR + i, d)
-        store(work, line * STEP + i, load(work, line * STEP + i) + w * d)
+    for i in range(N):
+        step = value_at(work, LINE * STEP + i, like)
+        d = value_at(work, LINE * PRIOR + i, like) - step
+        put_at(work, LINE * PRIOR + i, d)
+        put_at(work, LINE * STEP + i, step + w * d)
     at = 0
-    for i in range(0, size, WIDTH):
-        share = w * (1.0 - w) * load(work, line * PRIOR + i)
-        for j in range(i, size, WIDTH):
-            p = load(P, at)
-            store(P, at, p + w * (load(Q, at) - p) + share * load(work, line * PRIOR + j))
-            at += WIDTH
+    for i in range(N):
+        share = w * (1.0 - w) * value_at(work, LINE * PRIOR + i, like)
+        for j in range(i, N):
+            p = value_at(P, at, like)
+            put_at(P, at, p + w * (value_at(Q, at, like) - p) + share * value_at(work, LINE * PRIOR + j, like))
+            at += 1
     apply_step(x, P, work, like)
 
 
-def taken(P, work, rows, line, size, factor, room, place):
+def update_rows(P, work, rows, factor, room, place):
     """Update P and the step with the rows in the work space, their variances times a factor; return the sum of their ratios of noise.
 
     Innovations and variances are written to ``room`` at ``place``.
@@ -71,9 +69,9 @@ def taken(P, work, rows, line, size, factor, room, place):
     clear_step(work, like)
     noise = like
     for r in range(rows):
-        at = line * (ROWS + r) + size
-        variance = factor * load(work, at + WIDTH)
-        error, s = take_row(P, work, ROWS + r, load(work, at), variance, like)
+        at = LINE * (ROWS + r)
+        variance = factor * value_at(work, at + VARIANCE, like)
+        error, s = take_row(P, work, ROWS + r, value_at(work, at + RESIDUAL, like), variance, like)
         noise = noise + variance / s
         store(room, place + 2 * WIDTH * r, error)
         store(room, place + 2 * WIDTH * r + WIDTH, s)

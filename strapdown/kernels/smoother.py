@@ -93,60 +93,57 @@ class Outputs(NamedTuple):
     """(edges, m, m) for the first m states, or (0, m, m)."""
 
 
-def load_segment(segments, k, x, P, width):
+def load_segment(segments, k, x, P):
     """Read state and upper triangle of the covariance of row k of the segments; what is below the diagonal is not defined."""
-    n = len(x) - 1
-    for i in range(n + 1):
+    for i in range(N + 1):
         x[i] = segments[k, 4 + i]
-    at = 5 + n + k * segments.shape[1]
-    for i in range(n):
-        for j in range(i, n, WIDTH):
-            store(
-                P, width * i + j, load(segments, at + j - i)
-            )  # the excess is in the next row, which is written after it
-        at += n - i
+    at = 5 + N + k * segments.shape[1]
+    for i in range(N):
+        for j in range(i, N, WIDTH):
+            store(P, W * i + j, load(segments, at + j - i))  # the excess is in the next row, which is written after it
+        at += N - i
 
 
-def mirror(P, n, width):
+def mirror(P):
     """Copy the upper triangle of a matrix to the lower one."""
-    for i in range(n):
-        for j in range(i + 1, n):
-            P[width * j + i] = P[width * i + j]
+    for i in range(N):
+        for j in range(i + 1, N):
+            P[W * j + i] = P[W * i + j]
 
 
-def factorise(A, n, width):
+def factorise(A):
     """Replace the upper triangle of A by U in ``A = Uᵀ D⁻¹ U``, with D the diagonal of U; the diagonal then holds D⁻¹."""
-    for i in range(n):
+    for i in range(N):
         row = row_at(A, i)
         for k in range(i):
-            row = minus_row(row, A[width * k + i] * A[width * k + k], row_at(A, k))
+            row = minus_row(row, A[W * k + i] * A[W * k + k], row_at(A, k))
         put_row(A, i, 1.0, row)
-        A[width * i + i] = 1.0 / A[width * i + i]
+        A[W * i + i] = 1.0 / A[W * i + i]
 
 
-def solve(U, B, n, width):
+def solve(U, B):
     """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ D⁻¹ U X = B``; U as :func:`factorise` leaves it.
 
     Two rows of X are subtracted from the others as soon as they are known: these do not wait for each other, as terms of a sum would.
     """
-    for i in range(0, n - 1, 2):
+    for i in range(0, N - 1, 2):
         first, second = noisy_row_at(B, i), noisy_row_at(B, i + 1)
-        a, b = U[width * i + i], U[width * (i + 1) + i + 1]
-        second = minus_row(second, a * U[width * i + i + 1], first)
+        a, b = U[W * i + i], U[W * (i + 1) + i + 1]
+        second = minus_row(second, a * U[W * i + i + 1], first)
         put_noisy_row(B, i + 1, 1.0, second)
-        for k in range(i + 2, n):
-            row = minus_row(noisy_row_at(B, k), a * U[width * i + k], first)
-            put_noisy_row(B, k, 1.0, minus_row(row, b * U[width * (i + 1) + k], second))
-    for i in range(n):
-        put_noisy_row(B, i, U[width * i + i], noisy_row_at(B, i))
-    for i in range(n - 1, 0, -2):
+        for k in range(i + 2, N):
+            row = minus_row(noisy_row_at(B, k), a * U[W * i + k], first)
+            put_noisy_row(B, k, 1.0, minus_row(row, b * U[W * (i + 1) + k], second))
+    for i in range(N):
+        put_noisy_row(B, i, U[W * i + i], noisy_row_at(B, i))
+    for i in range(N - 1, 0, -2):
         second, first = noisy_row_at(B, i), noisy_row_at(B, i - 1)
-        first = minus_row(first, U[width * (i - 1) + i] * U[width * (i - 1) + i - 1], second)
+        first = minus_row(first, U[W * (i - 1) + i] * U[W * (i - 1) + i - 1], second)
         put_noisy_row(B, i - 1, 1.0, first)
         for k in range(i - 1):
-            a = U[width * k + k]
-            row = minus_row(noisy_row_at(B, k), a * U[width * k + i], second)
-            put_noisy_row(B, k, 1.0, minus_row(row, a * U[width * k + i - 1], first))
+            a = U[W * k + k]
+            row = minus_row(noisy_row_at(B, k), a * U[W * k + i], second)
+            put_noisy_row(B, k, 1.0, minus_row(row, a * U[W * k + i - 1], first))
 
 
 def add_product(A, row, column, B, C, count, inner, width):
@@ -185,9 +182,7 @@ def step_back(segments, k, models, space):
     x, predicted, after = space.x, space.predicted, space.after
     P, Q, gain, kept, columns, block = space.P, space.Q, space.gain, space.kept, space.columns, space.block
     later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
-    n, width, noisy = len(x) - 1, len(space.top) // 3, len(space.states)
-    noisy_width = len(gain) // n
-    load_segment(segments, k, x, P, width)
+    load_segment(segments, k, x, P)
     dt = segments[k, 0]
     part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
     copy_values(x, predicted, N + 1, 0.0)
@@ -200,21 +195,21 @@ def step_back(segments, k, models, space):
     write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
     copy_values(predicted, after, N + 1, 0.0)
     advance_without_noise(after, later_P, back, -dt, models.backward, coefficients, 0.0)
-    clear(columns, n * noisy_width)
+    clear(columns, N * NOISY_WIDTH)
     gather_noisy_columns(Q, columns)
-    for i in range(0, n * noisy_width, WIDTH):
+    for i in range(0, N * NOISY_WIDTH, WIDTH):
         store(gain, i, load(columns, i))
-    write_small_columns(P, Q, gain, kept, space.states, n, width)
-    for i in range(0, n * width, WIDTH):
+    write_small_columns(P, Q, gain, kept, space.states)
+    for i in range(0, N * W, WIDTH):
         store(P, i, load(P, i) + load(Q, i))
-    factorise(P, n, width)
-    solve(P, gain, n, width)
-    subtract_from_kept(gain, kept, space.states, noisy_width)
-    reduce_error(error, gain, space.states, n)
+    factorise(P)
+    solve(P, gain)
+    subtract_from_kept(gain, kept, space.states)
+    reduce_error(error, gain, space.states)
     # N (Y Nᵀ + Q̄), Y the later covariance at the start: only rows and columns of states with noise differ from those of Y.
-    add_product(later_P, width, 1, gain, columns, n, n, noisy_width)
+    add_product(later_P, W, 1, gain, columns, N, N, NOISY_WIDTH)
     clear(block, 0)
-    add_product(gain, 1, noisy_width, columns, block, noisy, n, noisy_width)
+    add_product(gain, 1, NOISY_WIDTH, columns, block, len(NOISY), N, NOISY_WIDTH)
     scatter_noisy_columns(columns, block, later_P)
     correct_filtered(x, error, later_x, later_P)
 
@@ -225,32 +220,31 @@ def clear(A, start):
         store(A, i, broadcast(0.0))
 
 
-def write_small_columns(P, Q, gain, kept, states, n, width):
+def write_small_columns(P, Q, gain, kept, states):
     """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's; ``kept`` is 0 for these."""
-    columns = len(gain) // n
     for r in range(len(states)):
         k = states[r]
         kept[r] = 1.0
-        if P[width * k + k] < Q[width * k + k]:
+        if P[W * k + k] < Q[W * k + k]:
             kept[r] = 0.0
-            for i in range(n):
-                gain[columns * i + r] = -P[width * min(i, k) + max(i, k)]
+            for i in range(N):
+                gain[NOISY_WIDTH * i + r] = -P[W * min(i, k) + max(i, k)]
 
 
-def subtract_from_kept(gain, kept, states, width):
+def subtract_from_kept(gain, kept, states):
     """Replace the gain by the columns of Nᵀ for the states with process noise."""
     for i in range(0, len(gain), WIDTH):
         store(gain, i, -1.0 * load(gain, i))
     for r in range(len(states)):
-        gain[width * states[r] + r] += kept[r]
+        gain[NOISY_WIDTH * states[r] + r] += kept[r]
 
 
-def reduce_error(error, gain, states, n):
+def reduce_error(error, gain, states):
     """Replace the error by N times it; ``gain`` has the columns of Nᵀ for the ``states`` with process noise."""
-    product = error[n:]
+    product = error[N:]
     put_noisy_row(product, 0, error[0], noisy_row_at(gain, 0))
     row = noisy_row_at(product, 0)
-    for k in range(1, n):
+    for k in range(1, N):
         row = minus_row(row, -error[k], noisy_row_at(gain, k))
     put_noisy_row(product, 0, 1.0, row)
     for r in range(len(states)):
@@ -295,15 +289,13 @@ def smooth_back(segments, starts, models, space, out):
     space : Workspace
     out : Outputs
     """
-    n = len(space.x) - 1
-    width = len(space.top) // 3
     edge = len(starts) - 1
     s = starts[edge]
-    load_segment(segments, s, space.later_x, space.later_P, width)
-    mirror(space.later_P, n, width)
+    load_segment(segments, s, space.later_x, space.later_P)
+    mirror(space.later_P)
     while True:
         while edge >= 0 and starts[edge] == s:
-            write_smoothed(out, edge, space.later_x, space.later_P, n, width)
+            write_smoothed(out, edge, space.later_x, space.later_P)
             edge -= 1
         if edge < 0:
             break
@@ -311,16 +303,16 @@ def smooth_back(segments, starts, models, space, out):
         step_back(segments, s, models, space)
 
 
-def write_smoothed(out, edge, x, P, n, width):
+def write_smoothed(out, edge, x, P):
     """Write a smoothed state to the row of an edge; of the covariance the mean of both triangles."""
-    for i in range(n + 1):
+    for i in range(N + 1):
         out.x[edge, i] = x[i]
-    for i in range(n):
-        out.variance[edge, i] = P[width * i + i]
+    for i in range(N):
+        out.variance[edge, i] = P[W * i + i]
     if edge < len(out.covariance):
         for i in range(out.covariance.shape[1]):
             for j in range(i, out.covariance.shape[2]):
-                value = 0.5 * (P[width * i + j] + P[width * j + i])
+                value = 0.5 * (P[W * i + j] + P[W * j + i])
                 out.covariance[edge, i, j] = value
                 out.covariance[edge, j, i] = value
 
