@@ -433,7 +433,7 @@ class Judge:
             return None
         candidate = None
         if self.memory[gate_rules.CANDIDATE]:
-            candidate = Candidate(attitude=body.x[1, :4], others=body.x[1, 4:], covariance=covariance_at(body, 1))
+            candidate = Candidate(x=body.x[1], covariance=covariance_at(body, 1))
         counters = dict(zip(self.problem.events.sensors, self.counters, strict=True))
         return replace(self.start(), candidate=candidate, counts=self.memory, counters=counters)
 
@@ -547,9 +547,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     model, initial, sizes = problem.model, problem.initial, instance_of(problem.model, layout)
     x, P = np.zeros((2, sizes.N + 1)), aligned_zeros(2, sizes.N, sizes.W)
     if initial.gate is not None and initial.gate.candidate is not None:
-        candidate = initial.gate.candidate
-        x[1] = np.concatenate([candidate.attitude, candidate.others])
-        P[1, :, : sizes.N] = candidate.covariance
+        x[1], P[1, :, : sizes.N] = initial.gate.candidate.x, initial.gate.candidate.covariance
     body = structure.Body(
         model=kernel_model(model, problem.variances),
         x=x,

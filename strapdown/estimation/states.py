@@ -66,10 +66,8 @@ class ProcessNoise:
 class Candidate:
     """Restart candidate that runs in parallel with a gated filter."""
 
-    attitude: Array
-    """q_fb (4,)."""
-    others: Array
-    """Gyro bias and error states (n − 3,)."""
+    x: Array
+    """q_fb, gyro bias and error states (n + 1,)."""
     covariance: Array
     """P (n, n)."""
 

@@ -97,7 +97,7 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     )
 
 
-def chosen_parts(condition, a, b):
+def select_parts(condition, a, b):
     """Return the tuple a in lanes in which the condition holds, b in the others."""
     return tuple(select(condition, x, y) for x, y in zip(a, b, strict=True))
 
@@ -120,8 +120,8 @@ def update_row(b, A, B, C, h, innovation, variance):
     precise = s > SHORT_FORM * variance
     if any_lane(precise):
         d = combine(1.0, symmetric_times_vector(A, h), -variance, ka)
-        A = chosen_parts(precise, symmetric_minus_outer(A, d, ka), A)
-        B = chosen_parts(precise, minus_outer(B, d, kb), B)
+        A = select_parts(precise, symmetric_minus_outer(A, d, ka), A)
+        B = select_parts(precise, minus_outer(B, d, kb), B)
     return (
         scale(innovation, ka),
         combine(1.0, b, innovation, kb),
@@ -139,8 +139,8 @@ def turned_by(q, correction):
     large = dot(correction, correction) > SQUARED_RANGE
     if any_lane(large):
         far, J = far_turn(correction)
-        moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
-        G = chosen_parts(large, J, G)
+        moved = select_parts(large, unit(quaternion_multiply(q, far)), moved)
+        G = select_parts(large, J, G)
     return moved + G
 
 
@@ -208,14 +208,12 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
     elif any_lane(together):
         at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
-        correction = chosen_parts(together, at_once[0], one_by_one[0])
-        b = chosen_parts(together, at_once[1], one_by_one[1])
-        A = chosen_parts(together, at_once[2], one_by_one[2])
-        B = chosen_parts(together, at_once[3], one_by_one[3])
-        C = chosen_parts(together, at_once[4], one_by_one[4])
-        e2 = select(together, at_once[5], one_by_one[5])
-        s2 = select(together, at_once[6], one_by_one[6])
-        nis = select(together, at_once[7], one_by_one[7])
+        correction = select_parts(together, at_once[0], one_by_one[0])
+        b = select_parts(together, at_once[1], one_by_one[1])
+        A = select_parts(together, at_once[2], one_by_one[2])
+        B = select_parts(together, at_once[3], one_by_one[3])
+        C = select_parts(together, at_once[4], one_by_one[4])
+        e2, s2, nis = select_parts(together, at_once[5:], one_by_one[5:])
     else:
         correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
     q, A, B = reset(q, A, B, correction)

@@ -49,13 +49,11 @@ def gauss_markov(decay, steps, values):
 
 def flicker_block(poles, gains, states, scale, normals, out):
     """Fill out (m,) with flicker noise, and update its 16 states: x ← p x + w, out = scale g · x."""
-    a = poles
-    c = gains
-    x = states
+    c, x = gains, states
     for k in range(out.shape[0]):
         w = normals[k]
         for i in range(16):
-            x[i] = a[i] * x[i] + w
+            x[i] = poles[i] * x[i] + w
         s0 = ((c[0] * x[0] + c[4] * x[4]) + c[8] * x[8]) + c[12] * x[12]
         s1 = ((c[1] * x[1] + c[5] * x[5]) + c[9] * x[9]) + c[13] * x[13]
         s2 = ((c[2] * x[2] + c[6] * x[6]) + c[10] * x[10]) + c[14] * x[14]

@@ -24,8 +24,8 @@ def load(array, start):
     return array.reshape(-1)[start : start + WIDTH].copy()
 
 
-def fetch(array, start):
-    """Have the machine bring ``array[start]`` from far memory, for it is read soon; it may lie outside."""
+def prefetch(array, start):
+    """Prefetch ``array[start]``, which is read soon; it may lie outside."""
 
 
 def load_triples(array, start, stride):

@@ -231,8 +231,8 @@ def _store(target: Any, builder: Any, sig: Any, array: Any, start: Any, value: A
     _write(builder, kind, array, start, _converted(builder, value, lanes, Lanes(kind.dtype, lanes.count)))
 
 
-@_instead_of(lane_values.fetch, lambda array, start: types.void(array, types.intp))
-def _fetch(target: Any, builder: Any, sig: Any, array: Any, start: Any) -> None:
+@_instead_of(lane_values.prefetch, lambda array, start: types.void(array, types.intp))
+def _prefetch(target: Any, builder: Any, sig: Any, array: Any, start: Any) -> None:
     place = builder.gep(builder.extract_value(array, DATA), [start])
     place = builder.bitcast(place, ir.IntType(8).as_pointer())
     function = ir.FunctionType(ir.VoidType(), [place.type, *[_INDEX] * 3])
@@ -402,7 +402,7 @@ def _signed_number(target: Any, builder: Any, sig: Any, word: Any) -> Any:
     return builder.sitofp(word, _vector(sig.return_type))
 
 
-# ------------------------------------------------------------------------------------------------ conditions and choice
+# ------------------------------------------------------------------------------------------------ conditions
 
 
 def _bits(builder: Any, mask: Any) -> Any:
@@ -411,7 +411,7 @@ def _bits(builder: Any, mask: Any) -> Any:
 
 
 @_instead_of(lane_values.all_lanes, types.boolean)
-def _everywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
+def _all_lanes(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     if not isinstance(sig.args[0], Lanes):
         return condition
     bits = _bits(builder, condition)
@@ -419,7 +419,7 @@ def _everywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
 
 
 @_instead_of(lane_values.any_lane, types.boolean)
-def _anywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
+def _any_lane(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     if not isinstance(sig.args[0], Lanes):
         return condition
     bits = _bits(builder, condition)
@@ -431,14 +431,14 @@ def _number_where(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     return builder.zext(builder.ctpop(_bits(builder, condition)), ir.IntType(64))
 
 
-def _choice(condition: Any, a: Any, b: Any) -> Any:
+def _select_type(condition: Any, a: Any, b: Any) -> Any:
     lanes = _lanes_among(tuple(t for t in (a, b) if isinstance(t, Lanes)))
     result = lanes or cpu_target.typing_context.unify_types(a, b)
     return result(condition, result, result)
 
 
-@_instead_of(lane_values.select, _choice)
-def _selection(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
+@_instead_of(lane_values.select, _select_type)
+def _select(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
     result = sig.return_type
     if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
         # Without this LLVM may move a final operation common to both values behind the selection, where it no longer fuses with a product:

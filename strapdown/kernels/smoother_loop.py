@@ -18,9 +18,9 @@ from strapdown.kernels.lane_values import (
     WIDTH,
     any_lane,
     broadcast,
-    fetch,
     load,
     load_quadruples,
+    prefetch,
     select,
     store,
 )
@@ -462,7 +462,7 @@ def smooth_back(segments, starts, angle_variance, rate_variance, work, out):
             for m in range(2):
                 i = w - 1 - 2 * part - m
                 for line in range(4):
-                    fetch(segments, start - ROW * (1 + i) + WIDTH * line)
+                    prefetch(segments, start - ROW * (1 + i) + WIDTH * line)
                 if i < count:
                     carry_error(work, group, errors, i)
                 if i < count_before:

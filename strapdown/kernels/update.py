@@ -265,16 +265,8 @@ def take_row(P, work, line, residual, variance, like):
     return error, s
 
 
-def product(P, work, row, line, like):
-    """Write P h of a row of the work space to another line."""
-    if LANES == 1:
-        product_by_chunks(P, work, row, line, like)
-    else:
-        product_by_elements(P, work, row, line, like)
-
-
 def product_by_chunks(P, work, row, line, like):
-    """Write P h, eight columns at once."""
+    """Write P h of a row of the work space to another line, eight columns at once."""
     for c in CHUNKS:
         s = work[row] * chunk_at(P, 0, c, like)
         for i in STATES[1:]:
@@ -283,7 +275,7 @@ def product_by_chunks(P, work, row, line, like):
 
 
 def product_by_elements(P, work, row, line, like):
-    """Write P h, one element after the other."""
+    """The same, one element after the other."""
     for j in range(N):
         t = like
         for i in range(N):
@@ -291,16 +283,14 @@ def product_by_elements(P, work, row, line, like):
         put_at(work, line + j, t)
 
 
-def minus_outer_rows(P, work, left, right, factor, like):
-    """Subtract a factor times the outer product of two lines of the work space, known to be symmetric, from P."""
-    if LANES == 1:
-        minus_outer_by_chunks(P, work, left, right, factor, like)
-    else:
-        minus_outer_by_elements(P, work, left, right, factor, like)
+product = product_by_chunks if LANES == 1 else product_by_elements
 
 
 def minus_outer_by_chunks(P, work, left, right, factor, like):
-    """Subtract an outer product, eight columns at once: below the diagonal its transpose, whose bits are those above."""
+    """Subtract a factor times the outer product of two lines of the work space, known to be symmetric, from P, eight columns at once.
+
+    Below the diagonal it is the transpose, whose bits are those above.
+    """
     columns = tuple(load_like(work, right + c, lanes_of(EIGHT)) for c in CHUNKS)
     rows = tuple(factor * load_like(work, left + c, lanes_of(EIGHT)) for c in CHUNKS)
     for i in STATES:
@@ -313,11 +303,14 @@ def minus_outer_by_chunks(P, work, left, right, factor, like):
 
 
 def minus_outer_by_elements(P, work, left, right, factor, like):
-    """Subtract an outer product, one element after the other."""
+    """The same, one element after the other."""
     for i in range(N):
         t = factor * value_at(work, left + i, like)
         for j in range(i, N):
             put_element(P, i, j, element_at(P, i, j, like) - t * value_at(work, right + j, like))
+
+
+minus_outer_rows = minus_outer_by_chunks if LANES == 1 else minus_outer_by_elements
 
 
 # ------------------------------------------------------------------------------------------------ very precise measurements, by a root of P

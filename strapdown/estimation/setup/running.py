@@ -168,7 +168,7 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
     need_mekf(setup, "the smoother")
     judging = {"gate": setup.gate, "robust": setup.robust, **options}
     states = setup.states or States()
-    blocks = _blocks(record, states)
+    start, blocks = _with_states(record, setup, initial)
     n = 6 + sum(block.size for block in blocks)
     segments = len(record.increments) + sum(len(series.time) for series in record.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
@@ -181,7 +181,6 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
         )
     if not states.gyro_drift_sigma:
         return estimation.smooth(record, setup.process_noise, initial, blocks, **judging)
-    start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
     full = bool(judging.pop("full_covariance", False))
     smoothed = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **judging)
     assert smoothed.whole_covariance is not None
@@ -202,11 +201,7 @@ def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **opt
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
     """Return the :func:`strapdown.estimation.observability` of each state of this setup's filter on a :func:`modelled_record`."""
     need_mekf(setup, "observability")
-    if setup.states is None:
-        return estimation.observability(record, setup.process_noise, initial)
-    blocks = _blocks(record, setup.states)
-    start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
-    return estimation.observability(record, setup.process_noise, start, blocks)
+    return estimation.observability(record, setup.process_noise, *_with_states(record, setup, initial))
 
 
 def initial_state(
@@ -275,17 +270,17 @@ def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
     return np.concatenate([np.empty((3, 0)), *(np.asarray(block.gyro_offset).T for block in error_states)], axis=1)
 
 
-def _blocks(record: ImuRecord, states: States) -> tuple[ErrorStates, ...]:
-    return states.blocks({series.sensor: series.kind for series in record.vectors})
+def _with_states(record: ImuRecord, setup: FilterSetup, initial: State) -> tuple[State, tuple[ErrorStates, ...]]:
+    """Return the initial state with the setup's error states, and their declarations; ``initial`` has the whole bias."""
+    if setup.states is None:
+        return initial, ()
+    blocks = setup.states.blocks({series.sensor: series.kind for series in record.vectors})
+    return state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma), blocks
 
 
 def prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.Problem:
     """Return a :func:`modelled_record` prepared for the filter with the setup's error states."""
-    if setup.states is None:
-        return forward.prepared(record, setup.process_noise, initial, ())
-    blocks = _blocks(record, setup.states)
-    start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
-    return forward.prepared(record, setup.process_noise, start, blocks, driven=True)
+    return forward.prepared(record, setup.process_noise, *_with_states(record, setup, initial), driven=True)
 
 
 def _reported(estimate: Estimate, states: States, initial: State) -> Estimate:
