@@ -330,11 +330,7 @@ def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
 def _in_registers(problem: Problem, options: Options) -> Passed:
     """Run the filter of attitude and bias, without a gate."""
     record, events, every = problem.record, problem.events, options.every
-    rows = len(record.increments) // every + 1
-    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 36)
-    written = [np.empty(shape) for shape in (*shapes, _innovations(events, judged=False))]
-    segments = np.empty((options.segments + 1 if options.segments else 0, 32))
-    out = six_states.Outputs._make((*written, segments[: options.segments]))
+    out, segments = outputs_in_registers(problem, options)
     body = body_in_registers(problem)
     state, number = body.state, 0
     for _, _, arguments, part in _in_spans(problem, out[:-2], body):
@@ -361,6 +357,18 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
         make_end=lambda: state_of_numbers(state),
         segments=segments[: number + 1],
     )
+
+
+def outputs_in_registers(problem: Problem, options: Options) -> tuple[six_states.Outputs, Array]:
+    """Return the arrays that the filter fills, and that of its predictions with a further row, for the end."""
+    rows = len(problem.record.increments) // options.every + 1
+    shapes = (
+        *((rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 36)),
+        _innovations(problem.events, judged=False),
+        (options.segments + 1 if options.segments else 0, 32),
+    )
+    *arrays, segments = (np.empty(shape) for shape in shapes)
+    return six_states.Outputs._make((*arrays, segments[: options.segments])), segments
 
 
 def body_in_registers(problem: Problem) -> six_states.Body:
@@ -559,19 +567,14 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
-        warming=_warming(problem),
+        warming=np.diff(temperature_of(problem.record)) / problem.record.intervals
+        if model.structure.slopes
+        else np.empty(0),
         warming_now=np.zeros(1),
         root=np.zeros(sizes.N**2),
     )
     put_state(body, initial)
     return body
-
-
-def _warming(problem: Problem) -> Array:
-    """Return the change of temperature over time in each interval (n,), K/s; empty without slopes of the bias."""
-    if not problem.model.structure.slopes:
-        return np.empty(0)
-    return np.asarray(np.diff(temperature_of(problem.record)) / problem.record.intervals)
 
 
 def temperature_of(record: ImuRecord) -> Array:
@@ -590,18 +593,12 @@ def aligned_zeros(*shape: int) -> Array:
     return numbers[first : first + math.prod(shape)].reshape(shape)
 
 
-def segment_width(model: Model) -> int:
-    """Return the numbers of a stored prediction, with seven that are not used."""
-    n = model.structure.n
-    return 5 + n + n * (n + 1) // 2 + WIDTH - 1
-
-
 def _run(problem: Problem, options: Options) -> Passed:
     """Run the filter of any number of error states, with or without a gate."""
     record, events, model, every = problem.record, problem.events, problem.model, options.every
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
     body = filter_body(problem, units)
-    out, predictions = _outputs(problem, options)
+    out, predictions = outputs(problem, options)
     judge = Judge(problem, options)
     weight, number = None, 0
     happened = gaps(record)
@@ -612,8 +609,8 @@ def _run(problem: Problem, options: Options) -> Passed:
         form = body._replace(length=body.length[at], turning=body.turning[at], warming=body.warming[intervals])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
-            outputs = judged._replace(filter=out_of_part)
-            number, reported = compiled(walk, instance_of(model, gate))(*arguments, every, judge.body(form), outputs)
+            judged = judged._replace(filter=out_of_part)
+            number, reported = compiled(walk, instance_of(model, gate))(*arguments, every, judge.body(form), judged)
             happened += gate_events(judged.events[:reported], events.sensors)
         else:
             number = compiled(walk, instance_of(model, filter_kernels))(*arguments, every, form, out_of_part)
@@ -654,10 +651,11 @@ def _estimate(problem: Problem, options: Options, out: structure.Outputs) -> Est
     )
 
 
-def _outputs(problem: Problem, options: Options) -> tuple[structure.Outputs, Array]:
+def outputs(problem: Problem, options: Options) -> tuple[structure.Outputs, Array]:
     """Return the arrays that the filter fills, and that of its predictions with a further row, for the end."""
     n, rows = problem.model.structure.n, len(problem.record.increments) // options.every + 1
     whole_rows = rows if options.whole_bias else 0
+    segment_width = 5 + n + n * (n + 1) // 2 + WIDTH - 1  # with seven numbers that are not used
     kept = n if options.error_state_covariance else 6
     shapes = (
         (rows, n + 1),
@@ -666,7 +664,7 @@ def _outputs(problem: Problem, options: Options) -> tuple[structure.Outputs, Arr
         (whole_rows, 6),
         (whole_rows if options.full_covariance else 0, 6, 6),
         _innovations(problem.events, judged=options.judged),
-        (options.segments + 1 if options.segments else 0, segment_width(problem.model)),
+        (options.segments + 1 if options.segments else 0, segment_width),
     )
     *arrays, predictions = (np.empty(shape) for shape in shapes)
     return structure.Outputs._make((*arrays, predictions[: options.segments])), predictions

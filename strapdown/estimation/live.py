@@ -36,7 +36,7 @@ from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import Judge, Options, gate_events, last_lock_outs
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import Change, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import filter, gate, six_states, structure
+from strapdown.kernels import filter, gate, six_states
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
 from strapdown.kernels.machine import address_of, compiled, read_only
@@ -47,6 +47,8 @@ from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_leve
 
 MAX_MEASUREMENTS = 64
 """Maximum number of measurements within one gyro interval."""
+ONE_ROW = 1 << 30
+"""Number of steps to the next stored row: only the first one is."""
 RESERVED = ("self", "time", "gyro", "delta_theta", "sigma", "reference_f")
 """Arguments of :meth:`LiveFilter.update` that are no measurements."""
 UPPER = np.triu_indices(3)
@@ -129,7 +131,7 @@ class LiveFilter:
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
         refuse("a filter of single samples", record=self._problem.model.of_record)
-        options = Options(gate=gate, robust=robust)
+        options = Options(every=ONE_ROW, gate=gate, robust=robust)
         self._judge, self._judged = Judge(self._problem, options), options.judged
         self._writers = {
             vectors.sensor: (float(place), vectors.kind == "attitude") for place, vectors in enumerate(series)
@@ -167,7 +169,9 @@ class LiveFilter:
             self._x, self._body = own[0][0], filter_._replace(x=own[0], P=own[1], length=length)
         else:
             self._x, self._body = own[0][:7], filter_._replace(state=own[0])
-        body, out = self._body, self._outputs(6 + model.states)
+        outputs = forward.outputs if self._whole else forward.outputs_in_registers
+        body: Any = self._body
+        out: Any = outputs(self._problem, options)[0]._replace(innovation=self._innovation)
         if options.judged:
             out = gate.Outputs(filter=out, weight=self._weight, events=self._events)
             body = judge.body(body)
@@ -182,21 +186,6 @@ class LiveFilter:
         types = dispatcher.typeof_pyval(self._kind), *map(dispatcher.typeof_pyval, (self._table, 0, 0))
         self._step = dispatcher.compile(types)
 
-    def _outputs(self, n: int) -> Any:
-        """Return the outputs of the kernels for n states, of which the innovations alone are used."""
-        if not self._whole:
-            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 36))]
-            return six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
-        return structure.Outputs(
-            x=np.empty((1, n + 1)),
-            variance=np.empty((1, n)),
-            covariance=np.empty((0, n, n)),
-            whole_variance=np.empty((0, 6)),
-            whole_covariance=np.empty((0, 6, 6)),
-            innovation=self._innovation,
-            segments=np.empty((0, 0)),
-        )
-
     def _live(self, dispatcher: Any, body: Any, out: Any, length: Array, results: int) -> kernel.Live:
         """Return the kernel's arrays."""
         sensors, most = list(self._sensors.values()), len(length)
@@ -210,7 +199,7 @@ class LiveFilter:
         measured = Measurements(
             *(read_only(column) for column in (time, place, sensor, value, sigma, noise, series, frame))
         )
-        arguments = read_only(edges), read_only(increment.reshape(1, 3)), measured, 1 << 30, body, out
+        arguments = read_only(edges), read_only(increment.reshape(1, 3)), measured, ONE_ROW, body, out
         return kernel.Live(
             address=address_of(dispatcher, arguments),
             arguments=arguments,

@@ -35,7 +35,7 @@ from strapdown.estimation.states import (
     State,
     covariance_blocks,
 )
-from strapdown.kernels import chains, smoother, smoother_loop, structure
+from strapdown.kernels import chains, smoother, smoother_loop
 from strapdown.kernels.gate_rules import FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude, step_aside
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
@@ -356,12 +356,8 @@ class _ManyStates:
             np.zeros(chains.SET * max(len(model.last), 1)),
         )
         space = smoother.Workspace._make((*states, *matrices, *others, noisy))
-        models = smoother.Models(model, _with_negative_noise(model))
+        steps_back = model._replace(  # noise of negative variance
+            angle_variance=-model.angle_variance, rate_variance=-model.rate_variance, chains=model.chains * [1.0, -1.0]
+        )
+        models = smoother.Models(model, steps_back)
         compiled(kernels.smooth_back)(segments, starts, models, space, smoother.Outputs(*outputs))
-
-
-def _with_negative_noise(model: structure.Model) -> structure.Model:
-    """Return a model whose process noise has the negative variances, for steps back in time."""
-    return model._replace(
-        angle_variance=-model.angle_variance, rate_variance=-model.rate_variance, chains=model.chains * [1.0, -1.0]
-    )

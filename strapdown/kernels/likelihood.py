@@ -146,13 +146,6 @@ def predict(state, part, dt, body, out):
     return state
 
 
-def part_at(span, now, cuts):
-    """Return the part of the record at a time, searched from the previous part."""
-    while span < len(cuts) and now > cuts[span]:
-        span += 1
-    return span
-
-
 def add_derivatives(room, number, free, step, score, information):
     """Add one event to the score Σ ∂ℓ/∂θ and the information; ℓ = ½ (log s + e²/s).
 
@@ -187,7 +180,8 @@ def add_derivatives(room, number, free, step, score, information):
 def update(state, e, now, measured, body, out):
     """Update all lanes with a measurement, and add to the sums of its part of the record."""
     span, kept = state
-    span = part_at(span, now, body.cuts)
+    while span < len(body.cuts) and now > body.cuts[span]:
+        span += 1
     counted(e, span, measured, body, out)
     return span, kept
 

@@ -83,12 +83,6 @@ def value_of(measured, place):
     return (value[first], value[first + 1], value[first + 2])
 
 
-def frame_row(measured, place, sensor):
-    """Return the row of ``triads`` of a measurement."""
-    s = measured.series
-    return s[sensor, FIRST_FRAME] + s[sensor, FRAME_STEP] * (place - s[sensor, FIRST_PLACE])
-
-
 def frame_at(triads, t):
     """Return row t of the frames as a 9-tuple."""
     return tuple(triads[t, i] for i in range(9))
@@ -96,7 +90,9 @@ def frame_at(triads, t):
 
 def frame_of(measured, place, sensor):
     """Return the frame of a measurement as a 9-tuple."""
-    return frame_at(measured.triads, frame_row(measured, place, sensor))
+    s = measured.series
+    row = s[sensor, FIRST_FRAME] + s[sensor, FRAME_STEP] * (place - s[sensor, FIRST_PLACE])
+    return frame_at(measured.triads, row)
 
 
 def degrees_of_freedom(kind):
