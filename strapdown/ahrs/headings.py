@@ -57,15 +57,15 @@ def online(steps: kernel.Steps, start: float, parameters: AhrsParameters, interv
     memory.start[0] = start
     compiled(kernel.heading_steps)(constants, kernel.Steps(*map(read_only, steps)), memory, out)
     known = out.sigma > 0.0
-    vectors = VectorMeasurements(
-        sensor="magnetometer",
-        kind="heading",
-        time=steps.time[known],
-        vector_b=out.direction[known],
-        reference_f=NORTH,
-        sigma=out.sigma[known],
-    )
+    vectors = _measured(steps.time[known], out.direction[known], out.sigma[known])
     return Headings(vectors, out.usual, out.iron, out.variance)
+
+
+def _measured(time: Array, direction: Array, sigma: Array) -> VectorMeasurements:
+    """Return heading measurements from directions to magnetic North (m, 3), body axes, with σ (m,), rad."""
+    return VectorMeasurements(
+        sensor="magnetometer", kind="heading", time=time, vector_b=direction, reference_f=NORTH, sigma=sigma
+    )
 
 
 def constants_of(parameters: AhrsParameters, interval: float) -> kernel.Constants:
@@ -109,8 +109,7 @@ def smoothed(steps: kernel.Steps, start: float, parameters: AhrsParameters, inte
     known, shown = steps.number > 0.0, steps.force_number > 0.0
     field = _held(steps.field / np.maximum(steps.number, 1.0)[:, None], known)
     vertical = _vertical(_held(steps.force / np.maximum(steps.force_number, 1.0)[:, None], shown), interval)
-    as_measured = _look(field, vertical, parameters, interval)
-    measured = as_measured
+    measured = _look(field, vertical, parameters, interval)
     usual = float(measured.usual[0, 0])
     iron, unshown = hard_iron.find(
         field, vertical, steps.frame, known, steps.time, interval, usual, parameters.unshown_iron_sigma
@@ -118,13 +117,11 @@ def smoothed(steps: kernel.Steps, start: float, parameters: AhrsParameters, inte
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
         without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval)
-        odds = np.clip((as_measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
+        odds = np.clip((measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
-        left = (OWN_IRON * parameters.hard_iron_sigma * measured.usual[0, 0]) ** 2 / np.maximum(
-            np.sum(iron**2, axis=1), 1e-30
-        )
+        left = (OWN_IRON * parameters.hard_iron_sigma * usual) ** 2 / np.maximum(np.sum(iron**2, axis=1), 1e-30)
         iron *= np.maximum(1.0 - left, 0.0)[:, None]
-        iron[lengths(iron) < hard_iron.NEGLIGIBLE * measured.usual[0, 0]] = 0.0
+        iron[lengths(iron) < hard_iron.NEGLIGIBLE * usual] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
         measured = _look(field, vertical, parameters, interval)
     steep = np.minimum(np.abs(measured.usual[:, 1]), MAX_DIP)
@@ -189,14 +186,8 @@ def _gathered(
     information = np.add.reduceat(information, begin)
     informed = information > 0.0
     total = total[informed] / lengths(total[informed])[:, None]
-    return VectorMeasurements(
-        sensor="magnetometer",
-        kind="heading",
-        time=steps.time[edge][informed],
-        vector_b=quaternion.rotate(quaternion.conjugate(steps.end[edge][informed]), total),
-        reference_f=NORTH,
-        sigma=1.0 / np.sqrt(information[informed]),
-    )
+    direction = quaternion.rotate(quaternion.conjugate(steps.end[edge][informed]), total)
+    return _measured(steps.time[edge][informed], direction, 1.0 / np.sqrt(information[informed]))
 
 
 def _vertical(force: Array, interval: float) -> Array:

@@ -98,8 +98,7 @@ def density(filtered: Estimate, sensor: str, interval: float, *, causal: bool) -
     innovations = filtered.innovations.get(sensor)
     if innovations is None or len(innovations.time) == 0:
         return np.ones(len(filtered.time))
-    level = np.ascontiguousarray((innovations.innovation / np.sqrt(innovations.variance))[:, :2])
-    level[~np.isfinite(level)] = 0.0
+    level = _level(innovations)
     memory, values = first_memory(level.shape[1], interval), np.empty(len(level))
     constants = averages(interval)
     if not causal:
@@ -111,14 +110,19 @@ def density(filtered: Estimate, sensor: str, interval: float, *, causal: bool) -
     return np.asarray(np.append(FIRST_DENSITY[0], values)[row])
 
 
+def _level(innovations: Innovations) -> Array:
+    """Return the level innovations over their σ (m, 2), 0 if not known."""
+    level = np.ascontiguousarray((innovations.innovation / np.sqrt(innovations.variance))[:, :2])
+    level[~np.isfinite(level)] = 0.0
+    return level
+
+
 def swell_density(filtered: Estimate, interval: float) -> float:
     """Return the largest mean over :data:`DENSITY_MEMORY` of the density of the accelerometer's level innovations at waves' frequencies.
 
     It is relative to that of white innovations. ``interval``: that of the filter's steps, s.
     """
-    innovations = filtered.innovations["accelerometer"]
-    level = np.ascontiguousarray((innovations.innovation / np.sqrt(innovations.variance))[:, :2])
-    level[~np.isfinite(level)] = 0.0
+    level = _level(filtered.innovations["accelerometer"])
     a, b = (-math.expm1(-interval / time) for time in SWELL_TIMES)
     white = a / (2.0 - a) + b / (2.0 - b) - 2.0 * a * b / (1.0 - (1.0 - a) * (1.0 - b))
     square = np.mean((low_pass(level, a) - low_pass(level, b)) ** 2, axis=1) / white
