@@ -412,7 +412,7 @@ class Judge:
         self.gate = options.gate
         self.options = gate_options(options.gate, options.robust)
         sensors = problem.events.sensors
-        self.memory, self.counters = remembered(options.gate, problem.initial.gate, sensors)
+        self.memory, self.counters = initial_counts(options.gate, problem.initial.gate, sensors)
 
     def body(self, form: structure.Body) -> gate.Body:
         """Return the body of the walk, with the gate around a filter."""
@@ -435,7 +435,7 @@ class Judge:
             events=np.empty((number + 1 + len(self.problem.events.sensors), 5)),
         )
 
-    def remembered(self, body: structure.Body) -> GateMemory | None:
+    def gate_memory(self, body: structure.Body) -> GateMemory | None:
         """Return the gate's state at the end, with the restart candidate in the filter's arrays; None without a gate."""
         if self.gate is None:
             return None
@@ -476,7 +476,7 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
     )
 
 
-def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
+def initial_counts(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
     """Return the gate's state with which a kernel continues: its ``memory``, and ``counters`` of these sensors."""
     counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.COUNTERS))
     counts[gate_rules.PASSES] = 1.0
@@ -629,7 +629,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         skipped=skipped_too(events, innovations),
         events=in_order(happened),
     )
-    memory = judge.remembered(body)
+    memory = judge.gate_memory(body)
     return Passed(
         estimate=estimate,
         make_end=lambda: state_of(body, memory, units),

@@ -482,7 +482,7 @@ class LiveFilter:
         """
         if not self._whole:
             return forward.state_of_numbers(self._body.state.copy())
-        return copy.deepcopy(forward.state_of(self._body, self._judge.remembered(self._body), {}))
+        return copy.deepcopy(forward.state_of(self._body, self._judge.gate_memory(self._body), {}))
 
     def __reduce__(self) -> Any:
         """Raise an error: a copy would share the arrays of the compiled kernel."""

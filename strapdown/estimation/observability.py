@@ -203,10 +203,10 @@ def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
         exact_f = s.references_f
         if s.kind == "heading":
             # Only the heading of the reference is used; its inclination is that of the measurement.
-            seen_f = quaternion.rotate(q, s.vector_b)
+            measured_f = quaternion.rotate(q, s.vector_b)
             level = np.linalg.norm(exact_f[:, :2], axis=1, keepdims=True)
-            size = np.linalg.norm(seen_f[:, :2], axis=1, keepdims=True)
-            exact_f = np.concatenate([exact_f[:, :2] / level * size, seen_f[:, 2:]], axis=1)
+            size = np.linalg.norm(measured_f[:, :2], axis=1, keepdims=True)
+            exact_f = np.concatenate([exact_f[:, :2] / level * size, measured_f[:, 2:]], axis=1)
         exact_b = np.where(np.isfinite(s.vector_b), quaternion.rotate(inverse, exact_f), np.nan)
         series.append(dataclasses.replace(s, vector_b=exact_b))
     return ImuRecord(time=record.time, increments=turns, vectors=tuple(series))

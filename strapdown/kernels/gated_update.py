@@ -31,9 +31,10 @@ from strapdown.kernels.iterated_update import (
     arc_over_chord,
     least_certain_axis,
     robust_weight,
-    seen_from,
+    tangent_after,
     tangent_at,
     tilt_variance,
+    with_noise,
 )
 from strapdown.kernels.lane_values import select
 from strapdown.kernels.layout import (
@@ -242,11 +243,6 @@ def iterated_update(body, i, e, measured, passes, options):
     return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost
 
 
-def with_noise(S, variance):
-    """Return an innovation covariance, upper triangle (6,), with the noise of its rows added."""
-    return S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]
-
-
 def decorrelated(F, innovation):
     """Return the innovations (3,) made independent by the factors of their covariance."""
     e1 = innovation[0]
@@ -260,7 +256,7 @@ def reset_from(body, i, q, now_q, step, M):
     A = attitude_covariance(body, i)
     new_q, G = moved(now_q, step)
     if A[0] + A[3] + A[5] > KNOWN:
-        _, G = seen_from(step, A)
+        _, G = tangent_after(step, A)
     turn_attitude(body.P[i], G)
     put_attitude(body.x[i], body.P[i], q, new_q)
 

@@ -57,7 +57,7 @@ def robust_weight(kind, parameter, numerator, passes, S, y, variance):
     w = 1.0
     for _ in range(passes):
         r = scale(1.0 / w, variance)
-        F = factored((S[0] + r[0], S[1], S[2], S[3] + r[1], S[4], S[5] + r[2]))
+        F = factored(with_noise(S, r))
         x = solved(F, y)
         distance = (r[0] * r[0] * x[0] * x[0]) / variance[0]
         distance += (r[1] * r[1] * x[1] * x[1]) / variance[1]
@@ -76,6 +76,11 @@ def robust_weight(kind, parameter, numerator, passes, S, y, variance):
             spread += (r[2] - r[2] * r[2] * F[5]) / variance[2]
             w = numerator / (parameter + distance + spread)
     return w
+
+
+def with_noise(S, variance):
+    """Return an innovation covariance, upper triangle (6,), with the noise of its rows added."""
+    return S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]
 
 
 def arc_over_chord(sine, along):
@@ -132,7 +137,7 @@ def tangent_at(q, A):
     return minus_outer(M, subtract(halfway, whole), axis), back
 
 
-def seen_from(correction, A):
+def tangent_after(correction, A):
     """Return the quaternion of a correction (3,), rad, and its M of :func:`tangent_at`."""
     turn, _ = moved((1.0, 0.0, 0.0, 0.0), correction)
     M, _ = tangent_at(turn, A)

@@ -16,7 +16,7 @@ from strapdown.kernels.gate_rules import (
     restart_width,
     start_undone,
 )
-from strapdown.kernels.iterated_update import seen_from
+from strapdown.kernels.iterated_update import tangent_after
 from strapdown.kernels.layout import (
     LINE,
     OTHERS,
@@ -123,7 +123,7 @@ def widen(body, memory):
             x[1 + j] += share * work[column + j]
         minus_outer_rows(P, work, column, column, inverse, 0.0)
     before = attitude_at(body, 1)
-    q, G = seen_from(turn, attitude_covariance(body, 1))
+    q, G = tangent_after(turn, attitude_covariance(body, 1))
     turn_attitude(P, G)
     put_attitude(x, P, before, quaternion_multiply(before, q))
     count_widening(memory)

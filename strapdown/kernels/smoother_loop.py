@@ -75,9 +75,9 @@ STEP = SHARE + 52 * WIDTH
 """Its dt and rotation vectors."""
 ERRORS = STEP + 4 * WIDTH
 """Smoothed errors (ε, β) of two groups alternately, a row of eight for each segment and one for the end of the group."""
-SEEN = ERRORS + 2 * (WIDTH + 1) * WIDTH
+RELATIVE = ERRORS + 2 * (WIDTH + 1) * WIDTH
 """a of each segment of a group, without the factor in ``FACTOR``, a row of eight each."""
-STEPPED = SEEN + WIDTH * WIDTH
+STEPPED = RELATIVE + WIDTH * WIDTH
 """Three numbers and d, a row of eight."""
 FACTOR = STEPPED + WIDTH
 JACOBIAN = FACTOR + WIDTH
@@ -237,7 +237,7 @@ def carry_error(work, group, errors, i):
     moved_there = work[group + MOVED + i]
     if moved_there != 0.0:
         t = group + MATRICES * i + TURN
-        s = SEEN + w * i
+        s = RELATIVE + w * i
         d = STEPPED
         x = work[e] * work[e] + work[e + 1] * work[e + 1] + work[e + 2] * work[e + 2]
         turn = load(work, t + 2)
@@ -273,7 +273,7 @@ def fold_jacobians(work, group, errors):
     rotates = load(work, group + MOVED) > 0.5
     if any_lane(rotates):
         e0, e1, e2, _ = load_quadruples(work, errors + w, w)
-        a0, a1, a2, _ = load_quadruples(work, SEEN, w)
+        a0, a1, a2, _ = load_quadruples(work, RELATIVE, w)
         a0, a1, a2 = scale(load(work, FACTOR), (a0, a1, a2))
         e = (e0, e1, e2)
         a = (select(rotates, a0, e0), select(rotates, a1, e1), select(rotates, a2, e2))
@@ -284,7 +284,7 @@ def fold_jacobians(work, group, errors):
                 _, J = moved((1.0, 0.0, 0.0, 0.0), e)
                 a = e
                 if work[group + MOVED + i] != 0.0:
-                    s = SEEN + w * i
+                    s = RELATIVE + w * i
                     a = scale(work[FACTOR + i], (work[s], work[s + 1], work[s + 2]))
                 J = multiply(inverse_right_jacobian(a), J)
                 for c in range(9):
