@@ -49,13 +49,21 @@ from strapdown.kernels.layout import (
     STRUCTURE,
     VARIANCE,
     N,
-    attitude_at,
     attitude_covariance,
     by_shape,
     put_at,
     value_at,
 )
-from strapdown.kernels.measurement import DIRECTION, HEADING, KIND, VECTOR, degrees_of_freedom, has_heading, value_of
+from strapdown.kernels.measurement import (
+    DIRECTION,
+    HEADING,
+    KIND,
+    VECTOR,
+    degrees_of_freedom,
+    has_heading,
+    quaternion_at,
+    value_of,
+)
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
 from strapdown.kernels.rows import measurement_of, store_rows, write_rows  # noqa: F401 - in the source by shape, too
 from strapdown.kernels.structure import MAX_PRECISION
@@ -176,7 +184,7 @@ def iterated_update(body, i, e, measured, passes, options):
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
     parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
-    q = attitude_at(body, i)
+    q = quaternion_at(body.x, i)
     R = rotation_matrix(q)
     if kind == HEADING and not has_heading(R, z):
         return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from strapdown.kernels.integration import large_exponential
 from strapdown.kernels.integration_polynomial import LARGEST_RATE, interval_quaternion, sized
+from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.rotation import quaternion_multiply, renormalized
 from strapdown.kernels.state import store_row
 
@@ -81,6 +82,6 @@ def uneven_steps(increments, edges, places, samples, previous, window, ratio, lo
             bound, kept = uneven_rates(increments, edges, first, end - first, i, work, rates)
             step, ended = interval_quaternion(rates, kept, series)
             if bound > LARGEST_RATE or not ended:
-                step = large_exponential((increments[i, 0], increments[i, 1], increments[i, 2]))
+                step = large_exponential(vector_at(increments, i))
             q = quaternion_multiply(q, step)
         store_row(steps, j, renormalized(q))

@@ -89,12 +89,6 @@ def copy_values(a, b, count, like):
         put_at(b, i, value_at(a, i, like))
 
 
-def attitude_at(body, i):
-    """Return the attitude of state i."""
-    x = body.x
-    return (x[i, 0], x[i, 1], x[i, 2], x[i, 3])
-
-
 def bias_at(body, i):
     """Return the gyro bias of state i."""
     x = body.x

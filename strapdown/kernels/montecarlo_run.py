@@ -18,7 +18,7 @@ import numpy as np
 from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, scale, subtract
 from strapdown.kernels.lane_angles import inverse_root
 from strapdown.kernels.lane_values import WIDTH, broadcast, halves, lanes_of, load_like, narrowed, select, store
-from strapdown.kernels.measurement import ATTITUDE, KIND, VECTOR, frame_at, vector_at
+from strapdown.kernels.measurement import ATTITUDE, KIND, VECTOR, frame_at, quaternion_at, vector_at
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, unit
 from strapdown.kernels.structure import Body as Filter
@@ -467,7 +467,7 @@ def measured_value(e, sensor, kind, body, like):
     events, draws = body.events, body.draws
     noise, exact = sensor_noise(e, sensor, events, draws, like), events.exact
     if kind == ATTITUDE:
-        true = (exact[e, 0], exact[e, 1], exact[e, 2], exact[e, 3])
+        true = quaternion_at(exact, e)
         return quaternion_multiply(true, exponential(noise))
     z = add(vector_at(exact, e), noise)
     if body.gyro.terms[3]:

@@ -30,6 +30,7 @@ from strapdown.kernels.lane_values import (
     select,
     store,
 )
+from strapdown.kernels.measurement import quaternion_at
 from strapdown.kernels.montecarlo_run import KEPT, PATTERN
 from strapdown.kernels.rotation import quaternion_multiply
 
@@ -117,8 +118,7 @@ def accumulate(kept, valid, truth, bins, out, score):
     for row in range(len(truth)):
         state = kept_state(kept, row, like)
         q, P, C = state[:4], state[7:28], state[22:28]
-        true = (truth[row, 0], truth[row, 1], truth[row, 2], truth[row, 3])
-        e_theta = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), true))
+        e_theta = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), quaternion_at(truth, row)))
         e_bias = subtract(state[28:], state[4:7])
         nees, definite = normalized_squares(e_theta, e_bias, P[:6], P[6:15], C)
         sound = (

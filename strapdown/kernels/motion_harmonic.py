@@ -8,6 +8,7 @@ with compensation, so the error over a chain of nodes is only the rounding of th
 from __future__ import annotations
 
 from strapdown.kernels.algebra import add_matrices
+from strapdown.kernels.measurement import quaternion_at
 from strapdown.kernels.rotation import quaternion_multiply
 
 
@@ -100,10 +101,10 @@ def chain(leaving, arriving, attitudes, lows):
     ``leaving[k]`` takes node k to the point half-way to the next, ``arriving[k + 1]`` is that point as seen from node k + 1: the step
     is ``(1 + a) ⊗ (1 + b)*``, its deviation ``a + b* + a ⊗ b*``.
     """
-    q = (attitudes[0, 0], attitudes[0, 1], attitudes[0, 2], attitudes[0, 3])
-    low = (lows[0, 0], lows[0, 1], lows[0, 2], lows[0, 3])
+    q = quaternion_at(attitudes, 0)
+    low = quaternion_at(lows, 0)
     for k in range(leaving.shape[0] - 1):
-        a = (leaving[k, 0], leaving[k, 1], leaving[k, 2], leaving[k, 3])
+        a = quaternion_at(leaving, k)
         b = (arriving[k + 1, 0], -arriving[k + 1, 1], -arriving[k + 1, 2], -arriving[k + 1, 3])
         ab = quaternion_multiply(a, b)
         q, low = advance(q, low, add_matrices(add_matrices(a, b), ab))
@@ -121,8 +122,8 @@ def evaluate(node, offset, cosines, sines, factors, amplitudes, mean, attitudes,
             rate_series(cosines[j], sines[j], factors, amplitudes, mean, rate)
             attitude_series(rate, series)
             last = j
-        q = (attitudes[j, 0], attitudes[j, 1], attitudes[j, 2], attitudes[j, 3])
-        low = (lows[j, 0], lows[j, 1], lows[j, 2], lows[j, 3])
+        q = quaternion_at(attitudes, j)
+        low = quaternion_at(lows, j)
         q, low = advance(q, low, deviation(series, offset[k]))
         for i in range(4):
             result[k, i] = q[i] + low[i]

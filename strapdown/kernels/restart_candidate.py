@@ -25,11 +25,11 @@ from strapdown.kernels.layout import (
     STRUCTURE,
     N,
     W,
-    attitude_at,
     attitude_covariance,
     bias_at,
     copy_values,
 )
+from strapdown.kernels.measurement import quaternion_at
 from strapdown.kernels.model import apply_chains, chain_matrix, chain_noise
 from strapdown.kernels.rotation import quaternion_multiply
 from strapdown.kernels.structural_zeros import products
@@ -122,7 +122,7 @@ def widen(body, memory):
         for j in range(3, N):
             x[1 + j] += share * work[column + j]
         minus_outer_rows(P, work, column, column, inverse, 0.0)
-    before = attitude_at(body, 1)
+    before = quaternion_at(body.x, 1)
     q, G = tangent_after(turn, attitude_covariance(body, 1))
     turn_attitude(P, G)
     put_attitude(x, P, before, quaternion_multiply(before, q))
