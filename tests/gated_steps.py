@@ -17,7 +17,14 @@ import numpy as np
 from strapdown import kinematics, quaternion
 from strapdown.checks import Array
 from strapdown.estimation import model as modelling
-from strapdown.estimation.forward import aged_states, gate_events, in_order, last_lock_outs, remembered, restart_states
+from strapdown.estimation.forward import (
+    aged_states,
+    gate_events,
+    in_order,
+    initial_counts,
+    last_lock_outs,
+    restart_states,
+)
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
@@ -211,7 +218,7 @@ class Supervision:
 
     def __init__(self, gate: Gate | None) -> None:
         self.gate, self.sensors = gate, ()
-        self.memory, self.counters = remembered(gate, None, ())
+        self.memory, self.counters = initial_counts(gate, None, ())
         self.candidate: GatedStepFilter | None = None
         self.reported = np.empty((0, 5))
 
@@ -246,7 +253,7 @@ class Supervision:
         """Return the row of a sensor in the counters."""
         if sensor not in self.sensors:
             self.sensors = (*self.sensors, sensor)
-            self.counters = np.vstack([self.counters, remembered(None, None, (sensor,))[1]])
+            self.counters = np.vstack([self.counters, initial_counts(None, None, (sensor,))[1]])
         return self.sensors.index(sensor)
 
     def _start_candidate(self, filter: Any, gate: Gate) -> None:
