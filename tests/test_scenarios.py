@@ -41,9 +41,9 @@ def test_what_is_no_sensor_is_refused(value):
 
 
 def test_one_sensor_is_given_as_a_tuple():
-    one = load_scenario("cubesat").sensors[0]
+    sensor = load_scenario("cubesat").sensors[0]
     with pytest.raises(InputError, match=r"^sensors is AttitudeSensor\(.*\); give a tuple"):
-        dataclasses.replace(load_scenario("cubesat"), sensors=one)
+        dataclasses.replace(load_scenario("cubesat"), sensors=sensor)
 
 
 @pytest.mark.parametrize("value", ["slew", motion.Coning])
