@@ -11,6 +11,7 @@ import numpy as np
 from strapdown import estimation
 from strapdown.checks import Hint, InputError
 from strapdown.estimation import multiple_model, setup
+from strapdown.estimation.angular_acceleration import MIN_SAMPLES
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import PRIOR_INFLATION, State
 from strapdown.records import ImuRecord, Origin, cut
@@ -75,8 +76,6 @@ ERRORS_INFLATION = 3.0
 factor the first update would be far from linear."""
 KNOWN = 1e-12
 """Share of the variances of attitude and bias of a filter whose innovations show the errors of the sensors only."""
-MIN_SAMPLES = 200
-"""Minimum number of gyro samples for its angular acceleration, which a lever arm needs."""
 
 
 def _with_sensor_errors(record: ImuRecord, filter_setup: FilterSetup, state: State) -> ImuRecord:
@@ -85,7 +84,8 @@ def _with_sensor_errors(record: ImuRecord, filter_setup: FilterSetup, state: Sta
     It is that of the first innovation of a filter whose attitude and bias are known.
     """
     last = max(np.searchsorted(record.time, series.time[:1]).sum() for series in record.vectors) + 1
-    part = cut(record, 0, min(max(last, MIN_SAMPLES), len(record.increments)))
+    last = max(last, 2 * MIN_SAMPLES)  # a lever arm needs the angular acceleration
+    part = cut(record, 0, min(last, len(record.increments)))
     known = replace(state, covariance=KNOWN * state.covariance)
     innovations = setup.run_modelled(part, filter_setup, known, gate=None, robust=None).innovations
 
