@@ -357,6 +357,20 @@ def test_the_smoother_recovers_the_attitude_of_a_start_in_motion(monkeypatch):
     assert largest[1] > 10.0
 
 
+def test_the_smoother_recovers_from_a_bias_far_beyond_its_initial_sigma(monkeypatch):
+    """Without magnetometer and rest: 4°/s about one axis, where the initial σ is 0.25°/s."""
+    whole = in_a_hurry(60.0)
+    part = whole.taken(whole.time > 112.3)
+    part = dataclasses.replace(part, rate=part.rate + np.array([0.0, 0.0, 0.07]), magnetic_field=None, magnetic_unit="")
+    errors = []
+    for misfit in (estimating.BIAS_MISFIT, np.inf):
+        monkeypatch.setattr(estimating, "BIAS_MISFIT", misfit)
+        errors.append(worst(ahrs.estimate(part, latency=0.0, smooth=True)))
+    assert errors[0]["inclination"] < 1.5
+    assert errors[1]["inclination"] > 5.0
+    assert errors[0]["heading"] < 0.7 * errors[1]["heading"]
+
+
 def test_a_wrong_field_at_the_very_start_is_no_disturbance_later():
     """The mean from which the field deviates begins with the average of a second, in which one step of 0.03 s has little weight."""
     plain = recording(20.0)

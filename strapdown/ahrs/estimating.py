@@ -43,6 +43,9 @@ from strapdown.units import DEGREE
 
 FAR_START = 20.0 * DEGREE
 """Rotation by which the smoother corrects the attitude at the start, rad, above which it is linearised about the corrected one again."""
+BIAS_MISFIT = 2.0
+"""RMS over the axes of the smoothed bias at the start, relative to its σ before the recording, above which that σ was too small: a gyro
+without factory calibration. It is multiplied by that ratio, and the smoother starts again."""
 MAX_STARTS = 3
 """Maximum number of such starts."""
 SMALL_TURN = 0.5 * DEGREE
@@ -263,14 +266,28 @@ def _run(prepared: Prepared, parameters: AhrsParameters, at_rest: Rests, options
             smoothed = estimation.smooth(
                 part, own.process_noise, state, blocks, full_covariance=True, error_state_covariance=False, **judged
             )
-            if quaternion.angle_between(smoothed.attitude[0], state.attitude) < FAR_START:
+            restart = _restart(state, smoothed)
+            if restart is None:
                 break
-            state = replace(state, attitude=smoothed.attitude[0])
+            state = restart
         parts.append(smoothed)
         if last < bounds[-1]:
             _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
             state = changed(state, functools.partial(change, last))
     return joined(parts)
+
+
+def _restart(state: estimation.State, smoothed: Estimate) -> estimation.State | None:
+    """Return the initial state from which to smooth again; None if the smoothed one is consistent with ``state``."""
+    covariance = state.covariance.copy()
+    change, P = smoothed.bias[0] - state.bias, covariance[3:6, 3:6]
+    misfit = float(np.sqrt(change @ np.linalg.solve(P, change) / 3.0))
+    if misfit > BIAS_MISFIT:
+        covariance[3:6] *= misfit
+        covariance[:, 3:6] *= misfit
+    elif quaternion.angle_between(smoothed.attitude[0], state.attitude) < FAR_START:
+        return None
+    return replace(state, attitude=smoothed.attitude[0], covariance=covariance)
 
 
 def _alignments(prepared: Prepared, added: Array, parameters: AhrsParameters) -> dict[int, Change]:
@@ -360,6 +377,7 @@ def _at_stamps(
         covariance=P.reshape(-1, 6, 6) if options.full_covariance else None,
         innovations=regions.scaled_innovations(filtered, level),
         skipped=prepared.skipped,
+        smoothed=options.smooth,
         events=filtered.events,
         error_states=_OfRows(filtered.error_states, row),
     )

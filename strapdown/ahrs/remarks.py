@@ -122,7 +122,7 @@ def _model(moved_by: str, result: AhrsEstimate) -> str:
         )
         return (
             f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
-            f"{beyond if bias > MAX_BIAS * parameters.bias_sigma else ''}"
+            f"{beyond if bias > MAX_BIAS * parameters.bias_sigma and not result.estimate.smoothed else ''}"
         )
     at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
     return f"{words} The gyro's bias is measured at rest, in {number} span{'s' if number > 1 else ''} of a second, ending at {at} s."

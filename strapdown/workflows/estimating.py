@@ -301,7 +301,6 @@ def _run_recording(
         truth=None if used.true_attitude is None else reference_of(used, slice(None), result.estimate),
         fixed_frame=fixed_frame(used),
         motion=motion,
-        smoothed=smooth,
         remarks=(*remarks(result, motion), *notes),
         details={
             **{f"parameter.{field.name}": getattr(parameters, field.name) for field in dataclasses.fields(parameters)},
