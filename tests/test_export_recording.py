@@ -26,8 +26,9 @@ SINGLE_SIGMA = 1e-3
 
 @functools.cache
 def case(name):
-    """A filter that has not started, and samples, with a gap: time, gyro, accelerometer, magnetometer; None: missing."""
+    """A filter that has not started; samples, some damaged, with a gap: time, gyro, accelerometer, magnetometer; None: missing."""
     recording = with_missing(swinging(duration=12.0, shaken=10.0)).taken(np.r_[:900, 980:1200])
+    recording.specific_force[250:252] = [300.0, -200.0, 500.0]  # damaged
     if name != "hand":
         parameters = of_motion("hand", magnetometer=True)
         if name == "white":
@@ -38,6 +39,7 @@ def case(name):
         field += generator(12, 0, "field").normal(0.0, 0.3, field.shape)
         field[5::13] = np.nan
         field[320:350] = 0.0
+        field[260] *= 20.0  # damaged
         recording = replace(recording, magnetic_field=field)
     else:
         # A gyro whose bias is measured in nearly every second at rest.

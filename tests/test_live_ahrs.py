@@ -89,6 +89,23 @@ def test_a_magnetometer_with_iron_in_the_unit_and_a_disturbed_field():
     assert np.linalg.norm(result.hard_iron) > 1.0
 
 
+def test_damaged_samples_are_left_out():
+    """Three in a row, which as they are turn the attitude by 10°; and a field of ten times its strength."""
+    plain = swinging(duration=12.0)
+    force, field = plain.specific_force.copy(), np.tile([0.0, 20.0, -43.0], (len(plain.time), 1))
+    plain = replace(plain, magnetic_field=field.copy())
+    force[500:503], field[700:702] = (
+        [[800.0, 0.0, 100.0], [0.0, 900.0, 0.0], [-300.0, 200.0, 10.0]],
+        [400.0, 0.0, 300.0],
+    )
+    damaged = replace(plain, specific_force=force, magnetic_field=field)
+    rows = ahrs.estimate(damaged, full_covariance=True).estimate
+    live = rows_live(damaged)
+    for mine, its in zip(live, (rows.attitude, rows.bias, rows.variance, rows.covariance), strict=True):
+        np.testing.assert_array_equal(mine[:-1], its[:-1])
+    assert quaternion.angle_between(live[0], rows_live(plain)[0]).max() < np.radians(0.5)
+
+
 @pytest.mark.parametrize("magnetometer", [False, True])
 def test_a_start_in_motion_is_aligned_by_the_means_over_a_second(magnetometer):
     """The first sample is tilted by 45°."""

@@ -355,16 +355,70 @@ def test_a_clipped_accelerometer_is_left_out():
     assert f"clipped in {np.sum(lost)} samples" in faults.words[0]
 
 
-def test_a_specific_force_beyond_any_accelerometer_is_left_out():
+def with_damaged(name: str, rows: slice, size: float) -> tuple[Recording, Recording]:
+    """A recording, and the same with samples of a size in any direction; each of these is different."""
+    plain = swing(10.0)
+    samples = getattr(plain, name).copy()
+    draw = np.random.default_rng(8).standard_normal((len(samples), 3))[rows]
+    samples[rows] = size * draw / np.linalg.norm(draw, axis=1, keepdims=True)
+    return plain, dataclasses.replace(plain, **{name: samples})
+
+
+def left_out(recording: Recording, name: str) -> np.ndarray:
+    return np.flatnonzero(np.isnan(getattr(sensor_faults.find(recording).recording, name)).any(axis=1))
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("specific_force", 300.0), ("specific_force", 900.0), ("specific_force", 3000.0), ("magnetic_field", 500.0)],
+)
+def test_some_damaged_samples_are_left_out(name, size, smooth):
+    """In swings of 8 rad/s; of the accelerometer they cost up to 20°."""
+    rows = slice(1000, 1005)
+    plain, damaged = with_damaged(name, rows, size)
+    np.testing.assert_array_equal(left_out(damaged, name), np.arange(1000, 1005))
+    assert ": 5, ignored" in sensor_faults.find(damaged).words[0]
+    whole, other = (ahrs.estimate(x, latency=0.0, smooth=smooth).estimate.attitude for x in (plain, damaged))
+    assert quaternion.angle_between(whole, other).max() < 0.5 * DEGREE
+
+
+@pytest.mark.parametrize(("name", "size"), [("specific_force", 300.0), ("magnetic_field", 500.0)])
+def test_large_samples_that_last_or_come_again_are_used(name, size):
+    """As of an accelerometer of 200 g at a runner's steps, or of a magnet."""
+    _, lasting = with_damaged(name, slice(1000, 1200), size)
+    np.testing.assert_array_equal(left_out(lasting, name), np.arange(1000, 1030))
+    _, again = with_damaged(name, slice(1000, 1600, 60), size)
+    np.testing.assert_array_equal(left_out(again, name), [1000])
+
+
+def test_an_impact_within_16_g_is_used():
     plain = swing(10.0)
     force = plain.specific_force.copy()
-    force[1000, 1] = 3000.0
-    recording = dataclasses.replace(plain, specific_force=force)
-    faults = sensor_faults.find(recording)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(faults.recording.specific_force).any(axis=1)), [1000])
-    assert "beyond 1000 m/s²: 1, ignored" in faults.words[0]
-    whole, damaged = (ahrs.estimate(x, latency=0.0).estimate.attitude for x in (plain, recording))
-    assert quaternion.angle_between(whole, damaged).max() < 0.5 * DEGREE
+    force[1000:1003] = [156.9, -140.0, 150.0], [-156.8, 120.0, 80.0], [30.0, 100.0, -156.0]
+    assert sensor_faults.find(dataclasses.replace(plain, specific_force=force)).words == ()
+
+
+@pytest.mark.parametrize("size", [30.0, 50.0, 1999.0])
+def test_a_damaged_rate_is_replaced_by_the_mean_of_those_beside_it(size):
+    plain, damaged = with_damaged("rate", slice(1000, 1800, 100), size)
+    faults = sensor_faults.find(damaged)
+    expected = plain.rate.copy()
+    expected[1000:1800:100] = 0.5 * (plain.rate[999:1799:100] + plain.rate[1001:1801:100])
+    np.testing.assert_array_equal(faults.recording.rate, expected)
+    assert faults.words == ("Damaged samples of the gyro: 8, replaced by the means of those beside them",)
+    whole, other = (ahrs.estimate(x, latency=0.0).estimate.attitude for x in (plain, damaged))
+    assert quaternion.angle_between(whole, other).max() < 0.1 * DEGREE
+
+
+def test_a_rate_that_changes_in_one_interval_is_used():
+    """A unit that is caught, and one that is shaken at the limit of its sampling."""
+    plain = swing(10.0)
+    rate = plain.rate.copy()
+    rate[1000:, 2] += 30.0
+    assert sensor_faults.find(dataclasses.replace(plain, rate=rate)).words == ()
+    shaken = plain.rate + np.outer(np.where(np.arange(len(rate)) % 2, 4.0, -4.0), [0.0, 1.0, 0.0])
+    assert len(sensor_faults.damaged_rates(shaken, plain.interval)) == 0
 
 
 def test_an_ordinary_recording_has_no_faults():

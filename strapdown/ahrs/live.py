@@ -61,8 +61,10 @@ class LiveAhrs:
     -----
     Attitude, bias and covariance after each sample equal, bit for bit, the online rows of :func:`strapdown.estimate` for a recording of
     these samples, except what that takes from the whole recording: ``interval`` must be the recording's median, its first
-    sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
-    the end of a recording ends a step of the filter. Samples before the first complete one are not used.
+    sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps, damaged rates). The last row
+    differs too, because the end of a recording ends a step of the filter. Samples before the first complete one are not used, nor a damaged
+    specific force or field: more than 16 g on an axis, or six times the usual field, for a moment, unless that comes again within ten
+    seconds. A damaged rate turns the attitude; omit such a sample.
 
     Over a gap the rotation is as uncertain as the rate of the seconds before changes; after one of more than half a second the attitude is
     treated as unknown, and is aligned again by the next samples. ``estimate`` knows the change of the rate from the whole recording.

@@ -31,6 +31,7 @@ from strapdown.codegen import c, design, javascript
 from strapdown.codegen.target import traced
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
 from strapdown.files import usable_folder, writable, write_text
+from strapdown.kernels.recording_samples import AGAIN, RANGE
 from strapdown.records import ImuRecord
 from strapdown.records.recording import LARGEST_FORCE
 from strapdown.vectors import VectorMeasurements, VectorSensor
@@ -173,7 +174,7 @@ def _origin(setup: FilterSetup | LiveAhrs, precision: str) -> str:
         f"For an IMU {field} a magnetometer and samples every {setup.interval:g} s, as strapdown.LiveAhrs. Fixed axes: East, (magnetic) "
         "North, up; without a magnetometer the first heading is arbitrary. Times are double in single precision too. A gap of up to an "
         "hour is bridged. Samples that come more than four times as fast as these are not used, nor those of a specific force above "
-        f"{LARGEST_FORCE:g} m/s^2.",
+        f"{LARGEST_FORCE:g} m/s^2, nor some of more than {RANGE:g} m/s^2 on an axis unless they come again within {AGAIN:g} s.",
         "",
     ]
     return "\n".join(

@@ -66,7 +66,7 @@ class Recording:
     @property
     def lasting(self) -> dict[str, np.ndarray]:
         """Arrays of Python that last from one sample to the next, by name."""
-        of_field = "field", "field_innovation", "field_density", "field_averages"
+        of_field = "field", "field_innovation", "field_density", "field_averages", "mean_square"
         arrays = {
             name: getattr(self.imu.arrays, name)
             for name in live_imu.LASTING

@@ -17,6 +17,7 @@ from strapdown.kernels.argument_tables import call, unpacked
 from strapdown.kernels.headings import heading_steps
 from strapdown.kernels.live import LENGTH, ROW, SIGMA, TIME, VALUE, Live, process
 from strapdown.kernels.measurement import vector_at
+from strapdown.kernels.recording_samples import AGAIN, USUAL_TIME, is_beyond_range, is_damaged, is_strong
 from strapdown.kernels.recording_steps import (
     average_samples,
     carry_to_stamps,
@@ -70,6 +71,8 @@ LASTING = {
         "",
         "of the coarse alignment: when it is due, s; numbers and sums of specific force and field",
     ),
+    "mean_square": ((1,), "", "of the field so far"),
+    "burst": ((2,), "wide", "when the last large specific forces and the last strong fields began, s"),
     "over_gap": ((1,), "", "variance of the rotation over the gaps in this step, rad^2"),
     "step_rate": ((3,), "", "rate at the start of the step, rad/s"),
     "rate_change": ((1,), "", "mean square change of the rate over a step, (rad/s)^2"),
@@ -239,7 +242,10 @@ def start(imu):
         a.turned[i] = 1.0 if i == 0 else 0.0
     if imu.magnetometer > 0:
         imu.first[0] = imu.time[0]
+        a.mean_square[0] = 0.0
     a.count[0] = 1
+    a.burst[0] = a.burst[1] = imu.time[0] - AGAIN
+    leave_out_damaged(imu)
     begin_step(imu)
     carry_to_sample(imu)
     look_for_rest(imu, False)
@@ -248,6 +254,7 @@ def start(imu):
 def take_sample(imu):
     """Take a sample after the first one."""
     a = imu.arrays
+    leave_out_damaged(imu)
     length = imu.time[0] - a.clock[0]
     if length > SHORT_GAP * imu.interval:
         a.over_gap[0] = min(a.over_gap[0] + turn_variance(imu, length), UNKNOWN_TURN)
@@ -265,6 +272,19 @@ def take_sample(imu):
             a.rate_change[0] += min(imu.step / RATE_MEMORY, 1.0) * (change - a.rate_change[0])
     carry_to_sample(imu)
     look_for_rest(imu, ended)
+
+
+def leave_out_damaged(imu):
+    """Set a damaged specific force or field to zero: it is missing."""
+    a, time = imu.arrays, imu.time[0]
+    damaged = is_damaged(a.burst, 0, time, is_beyond_range(vector_at(imu.accelerometer, 0)))
+    for i in range(3):
+        imu.accelerometer[0, i] = 0.0 if damaged else imu.accelerometer[0, i]
+    if imu.magnetometer > 0:
+        share = imu.interval / USUAL_TIME
+        damaged = is_damaged(a.burst, 1, time, is_strong(a.mean_square, vector_at(imu.magnetic, 0), share))
+        for i in range(3):
+            imu.magnetic[0, i] = 0.0 if damaged else imu.magnetic[0, i]
 
 
 def turn_variance(imu, length):
