@@ -8,6 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from test_ahrs import late
 
 import strapdown as sd
 from strapdown import motion, quaternion, recordings, vectors
@@ -272,6 +273,18 @@ def test_all_axes_are_signed_permutations_the_identity_first():
     assert len({matrix.tobytes() for matrix in AXES}) == 48
     assert all(np.array_equal(matrix @ matrix.T, np.eye(3)) for matrix in AXES)
     assert check_conventions.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
+
+
+@pytest.mark.parametrize(("behind", "start"), [(0.0, "No delay"), (0.011, "The mag"), (-0.2, "The mag")])
+def test_the_delay_of_the_magnetometer_is_noted_as_the_smoother_compensates_it(behind, start):
+    recording = late(field=behind)
+    note = check_conventions.examine(recording).notes[-1]
+    assert note == sd.ahrs.estimate(recording, smooth=True).delays.field_words
+    assert note.startswith(start)
+    assert "σ 0." in note
+    if behind:
+        assert float(note.partition(" come ")[2].split()[0]) == pytest.approx(1e3 * abs(behind), abs=1.0)
+        assert f"ms {'after' if behind > 0.0 else 'before'} the gyro's" in note
 
 
 @pytest.mark.parametrize(

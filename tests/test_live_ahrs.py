@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_ahrs import late
 
 from strapdown import ahrs, quaternion
 from strapdown.ahrs import HAND_HELD_WITHOUT_MAGNETOMETER, AhrsParameters, LiveAhrs
@@ -118,6 +119,15 @@ def test_a_start_in_motion_is_aligned_by_the_means_over_a_second(magnetometer):
     tilt = quaternion.to_matrix(result.estimate.attitude)[:, 2, 2]
     assert tilt[0] < 0.72
     assert np.all(tilt[105:200] > np.cos(np.radians(20.0)))
+
+
+def test_a_known_delay_of_the_magnetometer_is_made_good_by_the_gyro():
+    """As the class says; of 11 ms at up to 8 rad/s."""
+    recording = late(field=0.011)
+    field = recording.magnetic_field - 0.011 * np.cross(recording.rate, recording.magnetic_field)
+    rows = (rows_live(replace(recording, magnetic_field=m), latency=0.0)[0] for m in (recording.magnetic_field, field))
+    late_by, right = (np.sqrt(np.mean(quaternion.angle_between(q, recording.true_attitude)[1000:] ** 2)) for q in rows)
+    assert right < 0.1 * late_by
 
 
 def test_stamps_that_jitter_and_a_known_delay():

@@ -33,7 +33,7 @@ from strapdown.files import plain
 from strapdown.kernels import recording_steps
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings.sensor_faults import stuck_words
+from strapdown.recordings import sensor_delays, sensor_faults
 from strapdown.records.recording import Recording
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
@@ -156,7 +156,7 @@ class Examination:
     candidates : tuple of Candidate
         The best explanations, by score.
     notes : tuple of str, default empty
-        Conventions that cannot be checked with this recording.
+        Conventions that cannot be checked with this recording, and the delay of the magnetometer.
     doubts : tuple of str, default empty
         Values that are implausible under any convention.
     """
@@ -212,7 +212,7 @@ class ConventionWarning(UserWarning):
 
 def warn(source: Recording) -> bool:
     """Warn the caller of the calling function if axes, signs or units of a recording seem wrong; return whether they do."""
-    sentences = examine(source).warnings
+    sentences = _examined(source).warnings
     for words in sentences:
         warnings.warn(f"{source.source}: {words}", ConventionWarning, stacklevel=3)
     return len(sentences) > 0
@@ -236,6 +236,13 @@ def examine(recording: Recording) -> Examination:
     InputError
         If the recording has only a gyro, with which nothing can be compared.
     """
+    result = _examined(recording)
+    delays = sensor_delays.find(sensor_faults.find(recording).recording)  # as the smoother's
+    return replace(result, notes=(*result.notes, *filter(None, [delays.field_words])))
+
+
+def _examined(recording: Recording) -> Examination:
+    """Return :func:`examine`, without the delays."""
     if all(value is None for value in (recording.true_attitude, recording.specific_force, recording.magnetic_field)):
         raise InputError(
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer (with gravity) or a magnetometer is needed too; "
@@ -248,7 +255,7 @@ def examine(recording: Recording) -> Examination:
         if vectors is not None
     }
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
-    stuck = stuck_words(recording)
+    stuck = sensor_faults.stuck_words(recording)
     doubts += _too_fast(recording) + stuck
     unsaid = [f"as it seems, {change}" for change in unit_changes]  # gravity alone shows it, whatever the turns
     upright = at_rest(recording)

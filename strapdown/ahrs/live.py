@@ -69,7 +69,8 @@ class LiveAhrs:
     Over a gap the rotation is as uncertain as the rate of the seconds before changes; after one of more than half a second the attitude is
     treated as unknown, and is aligned again by the next samples. ``estimate`` knows the change of the rate from the whole recording.
 
-    The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here.
+    The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here. If a short one, τ, is known, such
+    as the ``magnetometer_delay`` of a calibration, give the field ``m - τ * np.cross(gyro, m)``.
 
     Examples
     --------

@@ -57,19 +57,25 @@ class Delays:
     @property
     def words(self) -> tuple[str, ...]:
         """Description of the delays."""
-        late, field = 1e3 * self.gyro, 1e3 * self.last_field
-        sentences = [
+        late = 1e3 * self.gyro
+        assumed = (
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.is_specified
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
             f"if the delay is known, give {Hint('latency')} (0: point samples)."
-        ]
+        )
+        return (assumed, f"{self.field_words}.") if self.last_field else (assumed,)
+
+    @property
+    def field_words(self) -> str:
+        """Description of the magnetometer's delay, and what :func:`strapdown.estimate` does with it; empty if it is not observable."""
+        field, sigma = 1e3 * self.last_field, f"σ {1e3 * self.field_sigma:.1g} ms"
         if field:
             side = "after" if field > 0.0 else "before"
-            sentences.append(
-                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms, compensated."
-            )
-        return tuple(sentences)
+            return f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, {sigma}, compensated in the estimate"
+        if self.field_sigma == np.inf:
+            return ""
+        return f"No delay of the magnetometer beside the gyro shows, {sigma}: none is compensated in the estimate"
 
     @property
     def last_field(self) -> float:
