@@ -402,6 +402,7 @@ def test_usual_frames_are_named():
     for own, words in (
         (ned * truth, ["North-East-Down and East-North-Up"]),
         (nwu * truth, ["North-West-Up and East-North-Up"]),
+        (nwu * ned.inv() * truth, ["North-West-Up and North-East-Down"]),
         (ned * truth * frd, ["North-East-Down and East-North-Up", "forward-right-down and forward-left-up"]),
         (Rotation.from_euler("z", 1.0) * truth, []),
     ):

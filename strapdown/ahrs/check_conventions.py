@@ -34,6 +34,7 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import sensor_delays, sensor_faults
+from strapdown.records.outputs import FIXED_FRAMES
 from strapdown.records.recording import Recording
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
@@ -56,11 +57,7 @@ ATTITUDE_READINGS: dict[str, Callable[[Array], Array]] = {
 }
 """Conversions of quaternions in other conventions to q_fb (body to fixed), scalar first."""
 
-FRAMES: dict[str, Array] = {
-    "East-North-Up": np.eye(3),
-    "North-East-Down": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
-    "North-West-Up": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-}
+FRAMES = {name: np.rint(quaternion.to_matrix(q)) for name, q in FIXED_FRAMES.items()}
 """Fixed frames, with the matrices that transform their components to East-North-Up."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +15,7 @@ from strapdown.checks import Array, Hint, InputError, array, increasing, unit_qu
 from strapdown.consistency.timeaverage import effective_samples
 from strapdown.records import Truth
 from strapdown.records.estimate import matrices
+from strapdown.records.outputs import FIXED_FRAMES
 from strapdown.records.recording import BRIDGED
 from strapdown.records.recording import interpolated as between_stamps
 from strapdown.units import DEGREE
@@ -22,13 +24,12 @@ ALIGNED = ("time", "fixed", "body")
 """Parts of an alignment: clocks, fixed frames, body frames."""
 USUAL_FRAMES = {
     "fixed": {
-        "North-East-Down and East-North-Up": (np.pi / np.sqrt(2.0), np.pi / np.sqrt(2.0), 0.0),
-        "North-West-Up and East-North-Up": (0.0, 0.0, np.pi / 2.0),
-        "East-North-Up and North-West-Up": (0.0, 0.0, -np.pi / 2.0),
+        f"{own} and {other}": quaternion.multiply(quaternion.conjugate(to), q)
+        for (own, q), (other, to) in itertools.permutations(reversed(FIXED_FRAMES.items()), 2)
     },
-    "body": {"forward-right-down and forward-left-up": (np.pi, 0.0, 0.0)},
+    "body": {"forward-right-down and forward-left-up": np.array([0.0, 1.0, 0.0, 0.0])},
 }
-"""Rotation vectors between usual frames, rad, that of the estimate first."""
+"""Rotations between usual frames (4,), from that of the estimate, the first, to that of the truth."""
 GROSS = 5.0 * DEGREE
 """A constant rotation above this is a difference of frames and not an error of a filter, rad."""
 LONGEST_OFFSET = 30.0
@@ -98,7 +99,7 @@ class Alignment:
 def _usual(name: str, rotation: Array) -> str:
     """Return the usual frames that differ by nearly this rotation vector, rad, in words; empty if there are none."""
     for words, usual in USUAL_FRAMES[name].items():
-        if quaternion.angle_between(quaternion.exp(rotation), quaternion.exp(usual)) < GROSS:
+        if quaternion.angle_between(quaternion.exp(rotation), usual) < GROSS:
             return f", as {words} do"
     return ""
 

@@ -26,6 +26,12 @@ __all__ = ["Angles", "euler", "heading"]
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 """Quaternion from East-North-Up to North-East-Down and back: 180° about the horizontal axis to the north-east."""
+FIXED_FRAMES = {
+    "East-North-Up": np.array([1.0, 0.0, 0.0, 0.0]),
+    "North-East-Down": NED_OF_ENU,
+    "North-West-Up": np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]),
+}
+"""Quaternions from usual fixed frames to East-North-Up."""
 
 
 class Angles(NamedTuple):
