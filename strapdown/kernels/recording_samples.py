@@ -113,6 +113,23 @@ def bends(samples, bend):
         bend[i] = largest
 
 
+def shifted_changes(field, turned, rows, stride, lag, square):
+    """Write the squared change (m, 2 k + 1) of the field from each row, in the frame fixed by the gyro, if it is −k to k strides late.
+
+    Each is over ``lag`` strides.
+    """
+    longest = square.shape[1] // 2
+    for j in range(len(rows)):
+        first, last = rows[j], rows[j] + stride * lag
+        before, after = rotation_matrix(quaternion_at(turned, first)), rotation_matrix(quaternion_at(turned, last))
+        for k in range(square.shape[1]):
+            late = stride * (k - longest)
+            at_first = matrix_times_vector(before, vector_at(field, first + late))
+            at_last = matrix_times_vector(after, vector_at(field, last + late))
+            change = combine(1.0, at_last, -1.0, at_first)
+            square[j, k] = dot(change, change)
+
+
 def field_changes(rate, field, turned, stride, lag, still, late, products):
     """Write c·w, w·w and c·c (k, 3) of the changes c of the field, and w of that by a unit delay; NaN where a sample is missing (NaN or 0).
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, median, non_negative
 from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -158,9 +157,10 @@ def _evidence(recording: Recording, turned: Array) -> tuple[float, tuple[Array, 
     field = recording.magnetic_field
     assert field is not None
     known = sampled(field)
-    if np.sum(known) < 2:
+    number = np.count_nonzero(known)
+    if number < 2:
         return 0.0, (np.empty(0),) * 4
-    if 2 * np.sum(known) < len(known):  # of a slow sensor, no two samples may be a span of the gyro's rows apart
+    if 2 * number < len(known):  # of a slow sensor, no two samples may be a span of the gyro's rows apart
         recording, turned, field = recording.taken(known), turned[known], field[known]
     time = recording.time
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
@@ -185,12 +185,8 @@ def _long_shift(recording: Recording, turned: Array, stride: int, lag: int) -> i
     rows = np.linspace(begin, end, SEARCHED_PAIRS, endpoint=False, dtype=int) if begin < end else np.empty(0, int)
     if longest < 1 or len(rows) == 0:
         return 0
-    shifts = np.arange(-longest, longest + 1)
-    first, last = (
-        quaternion.to_matrix(turned[at]) @ np.swapaxes(field[at[:, None] + stride * shifts], 1, 2)
-        for at in (rows, rows + stride * lag)
-    )
-    square = np.sum((last - first) ** 2, axis=1)
+    shifts, square = np.arange(-longest, longest + 1), np.empty((len(rows), 2 * longest + 1))
+    compiled(recording_samples.shifted_changes)(*map(read_only, (field, turned, rows)), stride, lag, square)
     known = np.isfinite(square).all(axis=1)
     if not known.any():
         return 0
