@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exported import STRICT, Compiled, Plain, by_node, c_files, compiler, run_sanitized
+from scipy.spatial.transform import Rotation
 from test_live_ahrs import swinging, with_missing
 
 import strapdown as sd
@@ -123,6 +124,23 @@ def test_c_equals_live_ahrs_to_rounding(compiled):
     name, f = compiled
     need_close(fed(f, case(name)[1]), expected(name), angle=1e-12, bias=1e-13, variance=1e-11)
     assert np.abs(np.diff(expected(name)[:, 4:7], axis=0)).max() > 1e-4  # a rest has corrected the bias
+
+
+def test_a_rest_after_a_slow_turn_counts_as_for_live_ahrs(compiled):
+    """The turn of the field is compared in spans that may be rests only: one of twenty seconds must not spoil the rest after it."""
+    name, f = compiled
+    time, draw = 0.01 * np.arange(3000), generator(13, 0, "slow turn")
+    turning = np.where((time > 4.0) & (time < 24.0), np.radians(0.8), 0.0)
+    attitude = Rotation.from_rotvec(np.outer(np.cumsum(turning) * 0.01, [1.0, 0.0, 0.0]))
+    still = draw.normal([2e-3, -1e-3, 5e-4], 1e-3, (3000, 3))
+    columns = [np.outer(turning, [1.0, 0.0, 0.0]) + still, attitude.inv().apply([0.0, 0.0, 9.81])]
+    if name != "hand":
+        columns.append(attitude.inv().apply([0.0, 20.0, -43.0]))
+    rows = [(t, *row) for t, *row in zip(time.tolist(), *(column.tolist() for column in columns), strict=True)]
+    by_python = by_live(fresh(case(name)[0]), rows)
+    need_close(fed(f, rows), by_python, angle=1e-10, bias=1e-11, variance=1e-8)
+    bias = by_python[:, 4:7]
+    assert np.abs(bias[2600] - bias[2390]).max() > 1e-6  # the rest after the turn has corrected it
 
 
 def test_after_a_short_gap_c_is_as_uncertain_as_live_ahrs(compiled):

@@ -226,7 +226,12 @@ class LiveAhrs:
                 headings.kernel.Outputs(*heading),
             ),
             judge_field=(r(a.field_innovation), of_field, a.field_averages, a.field_density),
-            watch=(starting.constants_of(self.interval, parameters), *map(r, samples), self._rests, at_rest),
+            watch=(
+                starting.constants_of(self.interval, parameters, magnetometer=self.magnetometer),
+                *map(r, samples),
+                self._rests,
+                at_rest,
+            ),
         )
 
     # ---------------------------------------------------------------------------------------------------------------------- samples

@@ -257,7 +257,9 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     """Return the spans in which the unit hardly moves: :func:`strapdown.kernels.rests.find_rest`."""
     if parameters.rest_bias_sigma == 0.0:
         return NO_REST
-    constants, memory = constants_of(recording.interval, parameters), memory_of(recording.interval, parameters)
+    with_field = recording.magnetic_field is not None
+    constants = constants_of(recording.interval, parameters, magnetometer=with_field)
+    memory = memory_of(recording.interval, parameters)
     memory.rest_clock[1] = recording.time[0]
     length = constants.parts * constants.part
     n = len(recording.time) // length
@@ -283,12 +285,13 @@ def rest_length(interval: float) -> tuple[int, int]:
     return parts, length // parts
 
 
-def constants_of(interval: float, parameters: AhrsParameters) -> kernel.Constants:
+def constants_of(interval: float, parameters: AhrsParameters, *, magnetometer: bool) -> kernel.Constants:
     """Return the kernel's constants at this interval of the samples, s."""
     parts, part = rest_length(interval)
     modelled = parameters.rate_random_walk**2
     walk = max(modelled, BIAS_DRIFT**2)
     return kernel.Constants(
+        with_field=int(magnetometer),
         parts=parts,
         part=part,
         span=QUIET_SPAN,

@@ -28,6 +28,11 @@ MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
 LOCAL = ("found_direction", "found_sigma", "found_usual", "found_variance")
 """Arrays of :data:`strapdown.kernels.live_imu.PASSING` that a branch writes: those are local arrays of the target."""
+OF_FIELD = (
+    *("field", "field_innovation", "field_density", "field_averages", "mean_square"),
+    *("field_before", "field_clock", "turned_slowly"),
+)
+"""Arrays that only a filter with a magnetometer has."""
 TIMES = ("start", "ring_time", "rest_clock", "field_clock")
 
 
@@ -66,14 +71,10 @@ class Recording:
     @property
     def lasting(self) -> dict[str, np.ndarray]:
         """Arrays of Python that last from one sample to the next, by name."""
-        of_field = "field", "field_innovation", "field_density", "field_averages", "mean_square"
-        arrays = {
-            name: getattr(self.imu.arrays, name)
-            for name in live_imu.LASTING
-            if self.imu.magnetometer or name not in of_field
-        }
+        arrays = {name: getattr(self.imu.arrays, name) for name in live_imu.LASTING}
         arrays |= self.field._asdict() if self.imu.magnetometer else {}
-        return arrays | (self.rest._asdict() if self.imu.rests else {})
+        arrays |= self.rest._asdict() if self.imu.rests else {}
+        return {name: array for name, array in arrays.items() if self.imu.magnetometer or name not in OF_FIELD}
 
     @property
     def arrays(self) -> tuple[Array, ...]:
@@ -177,7 +178,9 @@ def init(f: Any) -> Any:
         f.resting[1] = 0
         f.bias_variance[0], f.plausible_variance[0] = r.parameters.bias_sigma**2, starting.FIRST_BIAS_SIGMA**2
         for i in range(3):
-            f.rest_bias[0, i] = f.field_before[0, i] = 0.0
+            f.rest_bias[0, i] = 0.0
+            if r.imu.magnetometer:
+                f.field_before[0, i] = 0.0
     return body.OK
 
 

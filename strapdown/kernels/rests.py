@@ -18,6 +18,8 @@ from strapdown.kernels.state import store_row
 class Constants(NamedTuple):
     """Constants of the method, and of a unit."""
 
+    with_field: int
+    """Whether there is a magnetometer, whose field shows a slow turn."""
     parts: int
     """Number of parts of a span, whose mean rates are compared."""
     part: int
@@ -183,9 +185,12 @@ def find_rest(constants, time, memory):
         and (dot(rate, rate) <= constants.turning or fixed)
         and change_force <= 0.1 * square_force + constants.noise
     )
-    if variance >= constants.max_variance:
-        store_row(memory.field_before, 0, (0.0, 0.0, 0.0))
-    still = quiet and not turns_slowly(constants, rate, change, time, memory)
+    still = quiet
+    if constants.with_field > 0:
+        if variance >= constants.max_variance:
+            store_row(memory.field_before, 0, (0.0, 0.0, 0.0))
+        if quiet:  # a statement: an operand of "and" would be evaluated always by the exported filter
+            still = not turns_slowly(constants, rate, change, time, memory)
     store_row(memory.rest_rate, 0, rate)
     memory.rest_variance[0] = variance if still else math.inf
     memory.rest_gained[0] = math.inf
