@@ -268,6 +268,16 @@ def test_a_slow_gyro_in_mrad_per_s_is_named(reference):
     assert examination.listing().cells[0][0] == "gyro in mrad/s"
 
 
+def test_both_vectors_are_compared_at_the_same_times():
+    """Four seconds of the accelerometer lost in a fast window, whose place another window then takes."""
+    whole = simulated(1, duration=240.0, reference=False)
+    force = whole.specific_force.copy()
+    force[400:800] = np.nan
+    whole, lost = (check_conventions.examine(x) for x in (whole, replace(whole, specific_force=force)))
+    spread = [x.candidates[0].misfit["accelerometer and magnetometer"] for x in (whole, lost)]
+    assert spread[1] < 2.0 * spread[0]
+
+
 def test_all_axes_are_signed_permutations_the_identity_first():
     assert np.array_equal(AXES[0], np.eye(3))
     assert len({matrix.tobytes() for matrix in AXES}) == 48
@@ -373,6 +383,7 @@ def test_the_misfit_of_unrelated_directions_is_one():
     """cos of the angle between two random directions is uniform: its variance is a third."""
     u = np.random.default_rng(3).standard_normal((2, 5000, 3))
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    misfits = check_conventions._fixed_misfits(dict(zip(("accelerometer", "magnetometer"), u, strict=True)))
+    vectors = dict(zip(("accelerometer", "magnetometer"), u, strict=True))
+    misfits = check_conventions._fixed_misfits(vectors, dict.fromkeys(vectors, np.ones(5000, int)))
     assert misfits["gyro and magnetometer"] == pytest.approx(0.0, abs=1e-12)
     assert misfits["accelerometer and magnetometer"] == pytest.approx(1.0, rel=0.05)

@@ -35,7 +35,7 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import sensor_delays, sensor_faults
 from strapdown.records.outputs import FIXED_FRAMES
-from strapdown.records.recording import Recording
+from strapdown.records.recording import Recording, sampled
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -584,19 +584,13 @@ def _with_reference(recording: Recording, sensors: _Sensors, step: int) -> _Expl
         return None
     parts = {"gyro": np.repeat(_gyro_fits(turn, reference), len(FRAMES), axis=0)}
     to_enu = np.stack([frame.T for frame in FRAMES.values()])
-    windows = _windows(recording, sensors, step, _known(true[::step]))
+    windows = _windows(recording, sensors, step, sampled(true[::step]))
     for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
         v = _turned(means)  # (readings, 48, windows, 3)
         square = np.mean(np.sum(v**2, axis=-1), axis=-1)[:, None]
         mean = v.mean(axis=-2)[:, None] @ to_enu  # (readings, frames, 48, 3)
         parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(mean, square).reshape(-1, len(AXES))
     return _combined(parts, _floors(parts, FLOORS["reference"], sensors))
-
-
-def _known(true: Array) -> np.ndarray:
-    """Return a mask (m,) of the references (m, 4) that are attitudes."""
-    size = lengths(true)
-    return np.isfinite(size) & (size > 0.0)
 
 
 def _turns(recording: Recording, true: Array) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -606,7 +600,7 @@ def _turns(recording: Recording, true: Array) -> tuple[np.ndarray, np.ndarray, A
     """
     step = max(1, round(REFERENCE_SPAN / recording.interval))
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
-    first = first[_known(true[first]) & _known(true[first + step])]
+    first = first[sampled(true[first]) & sampled(true[first + step])]
     turn = _turns_between(recording, first, first + step)
     largest = np.sort(np.argsort(-lengths(turn))[:MAX_TURNS])
     return first[largest], first[largest] + step, turn[largest]
@@ -717,7 +711,7 @@ def _without_reference(recording: Recording, sensors: _Sensors, step: int) -> _E
     which, axes, changes = _one_wrong(tuple(windows.counts))
     vectors = {name: _turned(mean)[which, axes[name]] for name, mean in windows.means(attitudes).items()}
     number = np.array([len(change) for change in changes])
-    misfit = _fixed_misfits(vectors)
+    misfit = _fixed_misfits(vectors, windows.counts)
     return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))
 
 
@@ -742,14 +736,16 @@ def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray
     return np.array(attitudes), dict(zip(names, np.transpose(axes), strict=True)), list(words)
 
 
-def _fixed_misfits(vectors: dict[str, Array]) -> dict[str, Array]:
-    """Return the relative loss of magnitude of the means (..., windows, 3), and the spread of the angle between two of them."""
+def _fixed_misfits(vectors: dict[str, Array], counts: dict[str, np.ndarray]) -> dict[str, Array]:
+    """Return the relative loss of magnitude of the means (..., windows, 3), and the spread of the angle between two of them.
+
+    ``counts``: number of samples of each sensor in all windows; only windows with samples have a mean.
+    """
     length = {name: lengths(v) for name, v in vectors.items()}
     misfit = {f"gyro and {name}": np.maximum(0.0, 1.0 - np.mean(size, axis=-1)) for name, size in length.items()}
-    if len(vectors) == 2:
-        first, other = vectors
-        rows = min(length[first].shape[-1], length[other].shape[-1])
-        product = np.sum(vectors[first][..., :rows, :] * vectors[other][..., :rows, :], axis=-1)
-        cosine = product / np.maximum(length[first][..., :rows] * length[other][..., :rows], 1e-12)
+    both = np.all([n > 0 for n in counts.values()], axis=0)
+    if len(vectors) == 2 and both.any():
+        (first, u), (other, v) = ((name, vectors[name][..., both[n > 0], :]) for name, n in counts.items())
+        cosine = np.sum(u * v, axis=-1) / np.maximum(lengths(u) * lengths(v), 1e-12)
         misfit[f"{first} and {other}"] = 3.0 * np.var(cosine, axis=-1)  # two unrelated directions: 1/3
     return misfit

@@ -353,8 +353,8 @@ def corrected(recording: Recording, **samples: Array) -> Recording:
 
 
 def sampled(samples: Array) -> np.ndarray:
-    """Return a mask (n,) of the rows (n, 3) of a sensor that are samples: neither NaN nor all 0."""
-    return np.asarray(np.abs(samples) @ np.ones(3) > 0.0)
+    """Return a mask (n,) of the rows (n, k) of a sensor that are samples: neither NaN nor all 0."""
+    return np.asarray(np.abs(samples) @ np.ones(samples.shape[1]) > 0.0)
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
