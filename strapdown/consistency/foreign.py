@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from strapdown.consistency.judgement import DETECTABLE, Judgement, holm, judge, 
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.estimation.setup import from_toml, unmodelled
-from strapdown.records import Estimate, Origin
+from strapdown.records import Estimate, Origin, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -196,25 +196,14 @@ def check_attitudes(
             "check the unit of time"
         )
     remarks += alignment.words
-    aligned = in_truth_frames(common.attitude, alignment)
-    frame, probabilities, explained = "", dict[str, float](), tuple[Explanation, ...]()
-    if whole.covariance is None:
-        estimate = Estimate.from_arrays(common.time, aligned, innovations=own.innovations)
-    else:
-        derivatives = jacobian(common.time, aligned, true)
-        readings = _readings(common, alignment, derivatives)
-        error = quaternion.rotation_between(aligned, true.attitude)
-        probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-        frame, words = _chosen_frame(declared, probabilities)
-        remarks += words
-        body = quaternion.conjugate(quaternion.exp(alignment.body))
-        bias = None if common.bias is None else quaternion.rotate(body, common.bias)
-        estimate = Estimate.from_arrays(common.time, aligned, readings[frame], bias=bias, innovations=own.innovations)
-        whole = replace(whole, covariance=read_as(frame, whole.covariance, whole.attitude))
-        others = list(_other_frames(error, readings, frame, probabilities))
-        if common.bias is not None and not common.bias.any():
-            others.append(_zero_bias(true.bias, readings[frame]))
-        explained = explanations(error, readings[frame], derivatives, others, confidence_level=confidence_level)
+    aligned, reading = in_truth_frames(common.attitude, alignment), _Reading("", {})
+    if whole.covariance is not None:
+        reading = _read(common, aligned, true, alignment, declared, confidence_level)
+        whole = replace(whole, covariance=read_as(reading.frame, whole.covariance, whole.attitude))
+    estimate = Estimate.from_arrays(
+        common.time, aligned, reading.covariance, bias=reading.bias, innovations=own.innovations
+    )
+    remarks += reading.remarks
     if declared != error_frame:
         remarks.append(f"the file declares that its covariance is of the {declared} error")
     estimate = replace(
@@ -230,9 +219,9 @@ def check_attitudes(
         judgement=judge(estimate, **how),
         estimate=estimate,
         alignment=alignment,
-        error_frame=frame,
-        frame_probability=probabilities if declared == "find" else {},
-        explanations=tuple(replace(e, known=_is_known(e, estimate)) for e in explained),
+        error_frame=reading.frame,
+        frame_probability=reading.probabilities if declared == "find" else {},
+        explanations=tuple(replace(e, known=_is_known(e, estimate)) for e in reading.explanations),
         remarks=tuple(remarks),
         accuracy=accuracy_of(whole, theirs),
     )
@@ -294,6 +283,43 @@ def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
 
 
 # ------------------------------------------------------------------------------------------------------------ readings
+
+
+class _Reading(NamedTuple):
+    """The covariance of an estimate as that of the body-side error, in the truth's body axes; empty without one."""
+
+    frame: str
+    """Definition by which it is read."""
+    probabilities: dict[str, float]
+    """Of the definitions, by the errors."""
+    covariance: Array | None = None
+    bias: Array | None = None
+    """The estimate's bias in these axes, if it has one."""
+    explanations: tuple[Explanation, ...] = ()
+    remarks: Sequence[str] = ()
+
+
+def _read(
+    common: Series, aligned: Array, true: Truth, alignment: Alignment, declared: str, confidence_level: float
+) -> _Reading:
+    """Return the covariance by the ``declared`` definition, or by that which the errors show, and what would explain the errors.
+
+    ``aligned`` (m, 4): attitudes in the truth's frames.
+    """
+    derivatives = jacobian(common.time, aligned, true)
+    readings = _readings(common, alignment, derivatives)
+    error = quaternion.rotation_between(aligned, true.attitude)
+    probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
+    frame, remarks = _chosen_frame(declared, probabilities)
+    covariance = readings[frame]
+    others = list(_other_frames(error, readings, frame, probabilities))
+    bias = None
+    if common.bias is not None:
+        bias = quaternion.rotate(quaternion.conjugate(quaternion.exp(alignment.body)), common.bias)
+        if not common.bias.any():
+            others.append(_zero_bias(true.bias, covariance))
+    explained = explanations(error, covariance, derivatives, others, confidence_level=confidence_level)
+    return _Reading(frame, probabilities, covariance, bias, explained, remarks)
 
 
 def read_as(frame: str, covariance: Array, attitude: Array) -> Array:
