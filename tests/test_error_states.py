@@ -399,23 +399,6 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
 
 
 @pytest.mark.parametrize(
-    ("option", "at"),
-    [("all", 77), ("none", 1), ("none", 77), ("none", -1), pytest.param("a foreign block", 77, marks=pytest.mark.slow)],
-)
-def test_a_split_run_is_the_whole_run_to_the_bit(option, at):
-    record, blocks = record_of(anisotropic=option == "all"), OPTIONS[option]
-    n = len(record.increments)
-    whole, end = estimation.run_part(record, NOISE, start(), blocks, full_covariance=True)
-    first, middle = estimation.run_part(records.cut(record, 0, at % n), NOISE, start(), blocks, full_covariance=True)
-    rest = records.cut(record, at % n, n)
-    second, last = estimation.run_part(rest, NOISE, middle, blocks, full_covariance=True)
-    for name in ("attitude", "bias", "variance", "whole_covariance" if blocks else "covariance"):
-        joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
-        assert np.array_equal(joined, getattr(whole, name)), name
-    assert np.array_equal(last.covariance, end.covariance)
-
-
-@pytest.mark.parametrize(
     ("option", "gate"), [("all", None), ("none", None), ("none", Gate())], ids=["states", "registers", "gate"]
 )
 def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
@@ -561,18 +544,6 @@ def test_the_smoother_is_the_textbook_one(option):
     )
     assert np.max(np.abs(state_errors(estimate, q, b, values)) / sigma) < 1e-8
     assert np.max(np.abs(correlation(estimate.whole_covariance - P, sigma))) < 1e-8
-
-
-def test_the_rows_that_are_kept_do_not_change_the_filter():
-    """Every eighth edge alone is what it is among all, to the bit."""
-    record, blocks = record_of(SPUN, duration=1.0, anisotropic=True), OPTIONS["all"]
-    whole, rare = (
-        estimation.run(record, NOISE, start(SPUN), blocks, full_covariance=True, every=every) for every in (1, 8)
-    )
-    for name in ("attitude", "bias", "variance", "whole_covariance"):
-        assert np.array_equal(getattr(rare, name), getattr(whole, name)[::8]), name
-    for block in blocks:
-        assert np.array_equal(rare.error_states[block.name].values, whole.error_states[block.name].values[::8])
 
 
 # ------------------------------------------------------------------------------------------------------------------- observability

@@ -248,40 +248,6 @@ def test_by_default_a_candidate_doubts_the_bias_as_at_the_start():
     assert np.all(mean < high)
 
 
-def test_without_recovery_it_stays_lost():
-    trial = simulated("hard iron", 1)
-    estimate = estimation.run(trial.record, NOISE, lost(trial.initial, 1), (IRON,), gate=Gate(recovery=None))
-    assert not recoveries(estimate)
-    by_sensor = {event.sensor: event for event in estimate.events}
-    assert set(by_sensor) == {"mag", "acc"}
-    for sensor, event in by_sensor.items():
-        assert event.kind == "lock-out"
-        assert event.start < 0.2
-        assert event.value == pytest.approx(estimate.refused[sensor], abs=3)
-    assert quaternion.angle_between(estimate.attitude[-1], trial.record.truth.attitude[-1]) > 0.5
-    assert estimate.refused["mag"] > 100
-
-
-@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.slow)])
-def test_a_right_filter_never_starts_anew(runs):
-    """A tenth of the measurements 30 times as noisy: each starts a candidate, and none takes over."""
-    refused = total = 0
-    for run in range(runs):
-        trial = simulated("hard iron", run, duration=30.0)
-        series = []
-        for k, s in enumerate(trial.record.vectors):
-            rng = generator(7, run, f"outliers {k}")
-            struck = rng.random(len(s.time)) < 0.1
-            off = 30.0 * s.sigma[:, None] * rng.standard_normal((len(s.time), 3))
-            series.append(dataclasses.replace(s, vector_b=s.vector_b + struck[:, None] * off))
-            total += int(np.sum(struck))
-        record = dataclasses.replace(trial.record, vectors=tuple(series))
-        estimate = estimation.run(record, NOISE, trial.initial, (IRON,), gate=Gate())
-        assert not estimate.events
-        refused += sum(estimate.refused.values())
-    assert 0.9 < refused / total < 1.1
-
-
 # ---------------------------------------------------------------------------------------------------------- what a candidate knows
 
 

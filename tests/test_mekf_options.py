@@ -5,9 +5,8 @@ from dataclasses import replace
 import in_steps
 import numpy as np
 import pytest
-from measured import resting
 
-from strapdown import estimation, kinematics, montecarlo, motion, quaternion
+from strapdown import estimation, montecarlo, motion, quaternion
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise, initial_state
@@ -15,7 +14,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
+from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 OUTLIERS = Faults(outlier_probability=0.1, outlier_scale=10.0)
@@ -234,32 +233,3 @@ def test_a_gap_of_the_gyro_is_reported_and_grows_the_covariance_as_the_closed_fo
     v, u, time = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2, 1.0 + T
     assert after[0, 0] == pytest.approx(1e-6 + 1e-8 * time**2 + v * time + u * time**3 / 3.0, rel=1e-10)
     assert after[3, 3] == pytest.approx(1e-8 + u * time, rel=1e-10)
-
-
-def test_an_outage_of_all_measurements_grows_the_covariance_and_ends_consistent():
-    sensor_set = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
-    record = simulate(scenario(sensor_set, duration=4.0), 5)
-    estimate = estimation.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
-    assert not sum(estimate.refused.values())
-    growth = estimate.variance[149, 3:] - estimate.variance[50, 3:]
-    assert np.allclose(growth, NOISE.rate_random_walk**2 * (estimate.time[149] - estimate.time[50]), rtol=1e-9)
-
-
-def test_correlated_noise_is_decorrelated_exactly():
-    """One vector and a diffuse prior about one axis: the information matrix of the textbook, (Hᵀ C⁻¹ H + P⁻¹)⁻¹."""
-    r = np.array([0.0, 0.0, 9.81])
-    C = np.array([[4.0, 1.0, -1.5], [1.0, 2.0, 0.5], [-1.5, 0.5, 2.0]]) * 1e-2
-    series = VectorMeasurements(
-        sensor="f", kind="vector", time=[0.0], vector_b=[r + np.array([0.05, -0.08, 0.1])], reference_f=r, covariance=C
-    )
-    record = resting(series)
-    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
-    result = estimation.run(record, NOISE, start, full_covariance=True)
-    H = np.array([[0.0, -r[2], 0.0], [r[2], 0.0, 0.0], [0.0, 0.0, 0.0]])  # z = r + [r] δθ
-    P = np.linalg.inv(H.T @ np.linalg.solve(C, H) + np.eye(3) / 0.01)
-    x = P @ H.T @ np.linalg.solve(C, np.array([0.05, -0.08, 0.1]))
-    assert np.allclose(quaternion.log(result.attitude[0]), x, rtol=1e-9, atol=1e-12)
-    nis = np.array([0.05, -0.08, 0.1]) @ np.linalg.solve(H @ H.T * 0.01 + C, np.array([0.05, -0.08, 0.1]))
-    assert result.innovations["f"].nis[0] == pytest.approx(nis, rel=1e-12)
-    J = kinematics.right_jacobian(x)
-    assert np.allclose(result.covariance[0][:3, :3], J @ P @ J.T, rtol=1e-9, atol=1e-15)

@@ -214,33 +214,6 @@ def test_a_filter_that_models_far_too_little_noise_says_that_it_is_locked_out(fa
         assert estimation.smooth(modelled, NOISE, started(record, 0), gate=Gate()).events == estimate.events
 
 
-@pytest.mark.parametrize("case", ["step", "lost", "too little noise"])
-def test_a_record_in_parts_recovers_as_the_whole_does(case):
-    """Cut before the step, while it is refused, and after: the end state holds what the gate remembers."""
-    record, noise = simulate(scenario(duration=12.0), 4), 1.0
-    start = started(record, 0, attitude_sigma=2e-3)
-    if case == "step":
-        record = stepped_bias(record, np.array([0.03, -0.03, 0.03]), 300)
-    elif case == "lost":
-        start = turned(start)
-    else:
-        noise = 0.03
-    record = replace(record, vectors=tuple(s.noise_scaled(noise) for s in record.vectors))
-    whole, _ = estimation.run_part(record, NOISE, start, gate=Gate(), full_covariance=True)
-    state, parts, reported = start, [], []
-    for first, last in ((0, 23), (23, 250), (250, 337), (337, 600)):
-        part, state = estimation.run_part(
-            records.cut(record, first, last), NOISE, state, gate=Gate(), full_covariance=True
-        )
-        parts.append(part)
-        reported += [event for event in part.events if event.kind == "recovery" or last == 600]
-    for name in ("attitude", "bias", "covariance"):
-        joined = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])
-        assert np.array_equal(joined, getattr(whole, name)), name
-    assert sorted(map(str, reported)) == sorted(map(str, whole.events))
-    assert whole.events
-
-
 def judged(outcomes, recovery=3, limit=4):
     """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts and events."""
     memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.COUNTERS))
@@ -600,29 +573,3 @@ def test_robust_smoothing_is_better_and_consistent():
     assert squares[0] < 0.7 * squares[1]
     assert squares[0] < 0.4 * squares[2]
     assert 0.7 < nees < 1.7
-
-
-def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
-    record = simulate(scenario(duration=2.0), 1)
-    a, b = record.vectors
-    wrong = a.vector_b.copy()
-    wrong[7] = -wrong[7]
-    missing = a.vector_b.copy()
-    missing[7] = np.nan
-    start = started(record, 0)
-    gate = Gate(probability=1.0 - 1e-9)
-    estimate = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
-    other = estimation.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
-    assert np.array_equal(estimate.attitude, other.attitude)
-    assert np.array_equal(estimate.variance, other.variance)
-    assert estimate.refused == {"a": 1, "b": 0}
-    assert other.skipped == {"a": 1, "b": 0}
-
-
-def test_a_gate_that_refuses_nothing_is_the_plain_filter():
-    record = simulate(scenario(), 1)
-    start = started(record, 0)
-    plain = estimation.run(record, NOISE, start, full_covariance=True)
-    gated = estimation.run(record, NOISE, start, full_covariance=True, gate=Gate(probability=1.0 - 1e-14))
-    assert np.allclose(plain.attitude, gated.attitude, rtol=0.0, atol=1e-13)
-    assert np.allclose(plain.covariance, gated.covariance, rtol=1e-9, atol=1e-20)

@@ -21,7 +21,7 @@ from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, Vector
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-X, Y, UP = np.eye(3)
+X, _, UP = np.eye(3)
 
 
 def start(sigma=0.1):
@@ -31,14 +31,8 @@ def start(sigma=0.1):
 # ------------------------------------------------------------------------------------------------------------- at one time
 
 OUTLIERS = Faults(outlier_probability=0.1)
-STATES = {
-    "none": (),
-    "bias, drift and sway": (
-        error_states.VectorBias(sensor="a", bias_sigma=0.01, rate_random_walk=1e-4),
-        error_states.GyroGaussMarkov(bias_sigma=1e-3, correlation_time=5.0),
-        error_states.GaussMarkov(sensor="b", noise_sigma=0.02, correlation_time=0.5, frame="fixed"),
-    ),
-}
+IRON = error_states.VectorBias(sensor="a", bias_sigma=0.01, rate_random_walk=1e-4)
+SWAY = error_states.GaussMarkov(sensor="b", noise_sigma=0.02, correlation_time=0.5, frame="fixed")
 
 
 @functools.cache
@@ -70,9 +64,6 @@ def begun(record, option):
     error = (1.0, 0.5, -1.0) if option == "lost" else (0.05, -0.06, 0.07)
     attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
-
-
-IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
 
 
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
