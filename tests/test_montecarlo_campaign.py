@@ -4,7 +4,6 @@ import itertools
 import json
 import multiprocessing
 import os
-import re
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -423,28 +422,6 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     assert np.array_equal(np.sqrt(estimate.variance[rows]), held.statistics.example_sigma[5])
     # Causes can be sought in it: it holds its filter as any estimate does.
     assert setups.from_toml(records.read_attributes("short-montecarlo-run-5-estimate.h5")["filter"]) == held.plan.setup
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("short.toml", "--runs", 0), "runs is 0"),
-        (("sort",), "scenario 'sort' is not known"),
-        (("none.toml",), "none.toml does not exist"),
-        (("none.h5",), "none.h5 does not exist"),
-        (("short.toml", "--runs", 4, "--out", "x.csv"), "choose such a suffix"),
-        (("short.toml", "--runs", 4, "--filter", "short.toml"), r"no table \[filter\]"),
-        (("short.toml", "--runs", 4, "--threads", 0), "threads is 0"),
-        (("short.toml", "--runs", 4, "--replay", -1), "run is -1"),
-        (("short.toml", "--runs", 4, "--workers", 1, "--cluster", "tcp://localhost:1"), "exclude each other"),
-        (("short.toml", "--runs", 4, "--machine", "gpu"), "machine 'gpu'"),
-    ],
-)
-def test_the_command_refuses(command, arguments, message, tmp_path):
-    status, _, error = command(*arguments)
-    assert status == 2
-    assert re.search(message, " ".join(error.split())), error
-    assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from hdf5 import changed
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, records, scenarios
+from strapdown import cli, records, scenarios
 from strapdown.checks import InputError, count
 from strapdown.estimation import setup
 from strapdown.estimation.setup.states import States
@@ -68,6 +68,13 @@ CONSIDER = ["covariance", "short.toml", "--consider"]
         ([*BUDGET, "quarter.csv"], "an amplitude of 90°"),
         ([*CAMPAIGN, 8, "--out", "runs.h5", "--resume", "--overwrite"], "exclude each other"),
         ([*CAMPAIGN, 0, "--out", "new.h5"], "runs is 0"),
+        ([*CAMPAIGN, 4, "--out", "x.csv"], "choose such a suffix"),
+        ([*CAMPAIGN, 4, "--filter", "short.toml"], "no table [filter]"),
+        ([*CAMPAIGN, 4, "--replay", -1], "run is -1"),
+        ([*CAMPAIGN, 4, "--machine", "gpu"], "machine 'gpu'"),
+        (["montecarlo", "sort"], "scenario 'sort' is not known"),
+        (["montecarlo", "none.toml"], "none.toml does not exist"),
+        (["montecarlo", "none.h5"], "none.h5 does not exist"),
         (["check", "run/estimate.h5", "--confidence-level", 1], "confidence_level is 1"),
         (["tune", "record.h5", "--seed", -1, "--out", "new.toml"], "seed is -1"),
         (["tune", "record.h5", "--spacing", -1.0, "--out", "new.toml"], "spacing"),
@@ -82,6 +89,21 @@ CONSIDER = ["covariance", "short.toml", "--consider"]
         (["coning", "--frequency", "1e300"], "too few for any algorithm"),
         (["coning", "--rate", "1e-5"], "too few for any algorithm"),
         (["coning", "--rate", "0.9"], "too few for any algorithm"),
+        (["coning", "--runs", 0], "runs is 0; it must be a whole number of 1 or more"),
+        (["coning", "--seed", -1], "seed is -1; it must be a whole number of 0 or more"),
+        (["coning", "--angle", 0], "angle is 0 degrees; it must be greater than zero"),
+        (["coning", "--angle", 200], "angle is 200 degrees; the half-angle of a cone must be below"),
+        (["coning", "--angle", "nan"], "angle is nan; it must be a finite number"),
+        (["coning", "--frequency", -1], "frequency is -1"),
+        (["coning", "--rate", "inf"], "rate is inf"),
+        (["coning", "--duration", -5], "duration is -5"),
+        (["algorithms", "--tables", "lines.json"], "--tables cannot be written"),
+        (["coning", "--tables", "lines.json"], "--tables cannot be written"),
+        ([*CAMPAIGN, 8, "--tables", "lines.json"], "--tables cannot be written"),
+        (["covariance", "nowhere"], "nowhere"),
+        ([*CONSIDER, "star 1.delay"], "NAME=VALUE"),
+        ([*CONSIDER, "sta 1.mounting=3"], "did you mean 'star 1.mounting'"),
+        ([*CONSIDER, "star 1.bias=x"], "--consider star 1.bias is 'x'; give a number"),
         ([*CONSIDER, "scale_factor=-1"], "--consider scale_factor is -1; it must not be negative"),
         ([*CONSIDER, "initial.bias=-2"], "--consider initial.bias is -2"),
         ([*CONSIDER, "scale_factor=1e300"], "scale_factor is 1e+294; no error is larger"),
@@ -204,12 +226,6 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
         assert f"Causes were not searched for: {reason}." in result.output
         assert content["diagnosis"] == {"not_looked_for": reason}
         assert content["unmodelled"] == [asymmetry]
-
-
-def test_errors_are_taken_at_the_same_times(folder):
-    estimate = setup.read_estimate(folder / "run" / "estimate.h5")
-    with pytest.raises(InputError, match="same times"):
-        consistency.errors(estimate.attitude, estimate.bias, estimate.attitude[:-1], estimate.bias[:-1])
 
 
 @pytest.mark.parametrize("command", ["check", "report", "estimate", "integrate", "doctor", "tune", "allan"])

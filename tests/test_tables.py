@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from strapdown import cli
-from strapdown.checks import InputError
 from strapdown.report import page
 from strapdown.report.tables import to_csv, to_latex
 from strapdown.results import Column, Table
@@ -209,18 +208,6 @@ def test_a_report_shows_svg_and_names_pdf(tmp_path):
     content = page.stored_figure(tmp_path / "errors", "errors")
     assert "data:image" not in content
     assert "In errors.pdf, beside the result" in content
-
-
-def test_what_cannot_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
-    for command in (["algorithms"], ["coning"], ["covariance", "spin"], ["montecarlo", "spin"]):
-        result = CliRunner().invoke(cli.app, [*command, "--tables", "file"])
-        assert isinstance(result.exception, InputError)
-        assert "--tables cannot be written" in str(result.exception)
-    result = CliRunner().invoke(cli.app, ["coning", "--format", "gif"])
-    assert result.exit_code == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.skipif(LATEX is None, reason="no LaTeX on this machine; install TeX Live to compile the tables")
