@@ -566,28 +566,6 @@ def test_states_without_their_errors_are_a_filter_that_is_too_unsure():
     np.testing.assert_array_equal(without.filter_covariance, analysis.filter_covariance)
 
 
-WELL_CONDITIONED = {
-    "coning": "two-sample",
-    "tumbling-satellite": "one-sample",
-    "spin": "one-sample",
-    "slew-vibration": "two-sample",
-}
-"""Scenarios, and the integration that each asks for: two of them vibrate, and every star falls on the end of a step of two samples."""
-
-
-@pytest.mark.parametrize("name", WELL_CONDITIONED)
-def test_runs_have_the_predicted_sigma_and_errors_to_match(name):
-    scenario = white(name, min(load_scenario(name).duration, 20.0))
-    belief = dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * DEGREE, states=False),
-        integration=coning.ALGORITHMS[WELL_CONDITIONED[name]],
-    )
-    sigma = covariance.analyse(scenario, belief, epochs=5).filter_sigma
-    statistics = montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=belief, seed=3, epochs=5), runs=1000)
-    np.testing.assert_allclose(statistics.sigma, sigma, rtol=1e-3)
-    assert statistics.judge().verdict == "consistent"
-
-
 # ------------------------------------------------------------------------------------------------------------------- the rim
 
 
@@ -785,19 +763,6 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
         said.split()
     )
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_command_refuses_in_one_line(run):
-    for arguments, word in (
-        (("spin", "--consider", "star.delay"), "NAME=VALUE"),
-        (("spin", "--consider", "sta.mounting=3"), "did you mean 'star.mounting'"),
-        (("spin", "--consider", "star.bias=x"), "--consider star.bias is 'x'; give a number"),
-        (("spin", "--consider", "scale_factor=-1"), "--consider scale_factor is -1"),
-        (("nowhere",), "nowhere"),
-    ):
-        status, said, refused = run("covariance", *arguments, "--epochs", 4)
-        assert word in " ".join((said + refused).split())
-        assert status == 2
 
 
 def test_considered_errors_are_in_the_units_of_a_data_sheet():
