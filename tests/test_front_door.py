@@ -119,28 +119,6 @@ def test_noise_from_a_rest_recording_into_the_filter(tmp_path):
     assert np.all(wider.variance[-1, :3] > 1.5 * sd.estimate(record).variance[-1, :3])
 
 
-def test_tune():
-    true = scenario(300.0)
-    record = sd.simulate(true)
-    start = dataclasses.replace(sd.FilterSetup.for_scenario(true, states=False), sigma={"star 1": 5e-4, "star 2": 1e-4})
-    tuned = sd.tune(record, setup=start, free=["star 1.sigma"], starts=1, threads=1)
-    parameter = tuned["star 1.sigma"]
-    assert parameter.lower < 1e-4 < parameter.upper
-    assert abs(parameter.value / 1e-4 - 1.0) < 0.15
-    assert tuned.setup.sigma["star 1"] == pytest.approx(parameter.value)
-    assert len(sd.estimate(record, setup=tuned.setup).time) == len(record.time)
-
-
-def test_monte_carlo_verdict():
-    statistics = sd.monte_carlo(scenario(30.0), runs=120, seed=4, threads=1)
-    assert statistics.runs == 120
-    assert sd.check(statistics).verdict == "consistent"
-    wrong = dataclasses.replace(sd.FilterSetup.for_scenario(scenario(30.0), states=False), measurement_sigma_factor=0.5)
-    assert (
-        sd.check(sd.monte_carlo(scenario(30.0), runs=120, seed=4, setup=wrong, threads=1)).verdict == "not consistent"
-    )
-
-
 # ---------------------------------------------------------------------------------------------------- as the commands do it
 
 
@@ -237,27 +215,6 @@ def test_an_integrated_attitude_has_no_bias_and_no_sigma():
     assert len(sd.plots.estimate_overview(history).axes) == 3
 
 
-def test_files_are_recognised_by_their_content(tmp_path):
-    record = sd.simulate(scenario(10.0))
-    sd.write(record, tmp_path / "record.h5")
-    assert sd.read(tmp_path / "record.h5").origin.seed == 3
-    estimate = sd.estimate(record)
-    sd.write(estimate, tmp_path / "estimate.h5")
-    np.testing.assert_array_equal(sd.read(tmp_path / "estimate.h5").attitude, estimate.attitude)
-    sd.write(scenario(), tmp_path / "scenario.toml")
-    np.testing.assert_array_equal(
-        sd.simulate(tmp_path / "scenario.toml").increments, sd.simulate(scenario()).increments
-    )
-    sd.write(sd.FilterSetup.for_scenario(scenario(), states=False), tmp_path / "filter.toml")
-    assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == sd.FilterSetup.for_scenario(
-        scenario(), states=False
-    )
-    with pytest.raises(sd.InputError, match="units"):
-        sd.read(tmp_path / "record.h5", units={"gyro": "deg/s"})
-    with pytest.raises(sd.InputError, match="toml"):
-        sd.write(scenario(), tmp_path / "scenario.h5")
-
-
 @pytest.mark.parametrize(
     "call",
     [
@@ -273,6 +230,7 @@ def test_files_are_recognised_by_their_content(tmp_path):
         lambda: sd.check(3),
         lambda: sd.check(sd.estimate(sd.simulate(scenario(5.0))), np.zeros(3)),
         lambda: sd.write(3, "x.h5"),
+        lambda: sd.write(scenario(), "scenario.h5"),
         lambda: sd.read("no-such-file.h5"),
         lambda: sd.allan_deviation(np.zeros(100)),
         lambda: sd.fit_noise([math.nan] * 100, 0.1),
@@ -303,31 +261,6 @@ def test_check_refuses_the_truth_of_another_record():
         sd.check(estimate, dataclasses.replace(slower, origin=None))
     with pytest.raises(sd.InputError, match="epochs"):
         sd.check(estimate, sd.simulate(scenario(5.0)).truth)
-
-
-def test_an_inverted_accelerometer_is_warned_of():
-    """What the command warns of, Python does too: at rest it reads -g upward."""
-    n = 400
-    force = np.tile([0.0, 0.0, -9.81], (n, 1)) + 0.01 * np.random.default_rng(1).standard_normal((n, 3))
-    rate = 1e-3 * np.random.default_rng(2).standard_normal((n, 3))
-    walk = sd.recordings.Recording(source="walk.csv", time=0.01 * np.arange(n), rate=rate, specific_force=force)
-    with pytest.warns(
-        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*`invert='accelerometer'`"
-    ):
-        sd.estimate(walk)
-
-
-def test_covariance_analysis_is_that_of_the_matched_filter():
-    analysis = sd.covariance_analysis(scenario(20.0), epochs=10)
-    estimate = sd.estimate(
-        sd.simulate(scenario(20.0)),
-        initial=sd.estimation.setup.initial_state(
-            sd.FilterSetup.for_scenario(scenario(20.0), states=False), sd.simulate(scenario(20.0)).truth.attitude[0]
-        ),
-    )
-    # Linear about the truth there and about the estimate here, which lie some σ of 1e-4 rad apart.
-    off = (analysis.filter_covariance[-1] - estimate.covariance[-1]) / np.outer(estimate.sigma[-1], estimate.sigma[-1])
-    assert 0.0 < np.abs(off).max() < 1e-3
 
 
 # ---------------------------------------------------------------------------------------------------------- results in print

@@ -13,7 +13,7 @@ from strapdown import scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.recordings.recordfiles import read_record, write_record
-from strapdown.records import ImuRecord, Origin, read_attributes
+from strapdown.records import ImuRecord, read_attributes
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
 
@@ -112,16 +112,6 @@ def test_foreign_and_damaged_hdf5_is_refused(written, damage, message):
     damage(written)
     with pytest.raises(InputError, match=message):
         read_record(written)
-
-
-def test_a_failed_write_leaves_the_old_file(simulated, tmp_path):
-    path = tmp_path / "record.h5"
-    write_record(path, simulated[1])
-    before = path.read_bytes()
-    with pytest.raises(TypeError):
-        write_record(path, dataclasses.replace(simulated[1], origin=Origin(source=object())))
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["record.h5"]
 
 
 def test_missing_samples_of_every_kind_go_through_a_file(simulated, tmp_path):

@@ -220,14 +220,6 @@ def test_sensor_names_with_a_slash_survive(tmp_path):
     assert dict(read.skipped) == {"GPS/heading": 1}
 
 
-def test_sigma_and_nis():
-    e = estimate()
-    np.testing.assert_allclose(e.sigma**2, e.variance, rtol=1e-15)
-    i = e.innovations["star tracker"]
-    np.testing.assert_allclose(i.nis, i.whitened[:, 0] ** 2 + i.whitened[:, 1] ** 2, rtol=1e-15)
-    assert e.innovations["magnetometer"].nis.shape == (0,)
-
-
 def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
     written = estimate()
     truth = Truth(attitude=written.attitude, movement=np.arange(7) > 3)

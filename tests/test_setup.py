@@ -150,22 +150,6 @@ def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
         setup.modelled_record(record, dataclasses.replace(filter_setup, sigma={"star one": 1e-3}))
 
 
-def test_truth_travels_in_the_estimate_file(tmp_path):
-    record = scenarios.simulate(scenario(duration=5.0))
-    filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
-    estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, record.truth.attitude[0]))
-    setup.write_estimate(tmp_path / "with.h5", dataclasses.replace(estimate, truth=record.truth))
-    setup.write_estimate(tmp_path / "without.h5", estimate)
-    truth = setup.read_estimate(tmp_path / "with.h5").truth
-    np.testing.assert_array_equal(truth.attitude, record.truth.attitude)
-    np.testing.assert_array_equal(truth.bias, record.truth.bias)
-    assert setup.read_estimate(tmp_path / "without.h5").truth is None
-    np.testing.assert_array_equal(setup.read_estimate(tmp_path / "with.h5").attitude, estimate.attitude)
-    with pytest.raises(InputError, match="rows"):
-        setup.write_estimate(tmp_path / "bad.h5", dataclasses.replace(estimate, truth=record.truth.taken(slice(-1))))
-    assert not (tmp_path / "bad.h5").exists()
-
-
 def unmodelled(scenario, states=None):
     filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), states=states)
     return setup.unmodelled_errors(Origin(gyro=scenario.gyro, scenario=scenario), filter_setup)
@@ -273,19 +257,6 @@ def test_outliers_are_reported_unless_the_filter_has_a_gate_or_robust_weights():
         said = " ".join([*estimate.remarks, *montecarlo.campaign.words(runs, sd.check(estimate))])
         assert "states=True" not in said  # which has none for outliers
         assert "anees" not in runs.summary()  # no run is finished
-
-
-def test_smoothing_by_a_setup_is_that_of_the_smoother():
-    record = scenarios.simulate(scenario(duration=10.0), 3)
-    filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
-    start = setup.initial_state(filter_setup, record.truth.attitude[0])
-    smoothed = setup.smooth(record, filter_setup, start, full_covariance=True)
-    modelled = setup.modelled_record(record, filter_setup)
-    same = estimation.smooth(modelled, filter_setup.process_noise, start, full_covariance=True)
-    np.testing.assert_array_equal(smoothed.attitude, same.attitude)
-    np.testing.assert_array_equal(smoothed.covariance, same.covariance)
-    plain = setup.run(record, filter_setup, start)
-    assert np.all(smoothed.variance <= plain.variance * (1.0 + 1e-9))
 
 
 @pytest.mark.parametrize("smooth", [False, True])
