@@ -40,25 +40,6 @@ def swaying(kind="vector", duration=40.0) -> Scenario:
     )
 
 
-def test_modelled_record_gives_a_series_three_and_keeps_its_course():
-    record = scenarios.simulate(swaying(duration=2.0), 1)
-    course = np.linspace(1.0, 2.0, len(record.vectors[0].time))
-    varying = dataclasses.replace(record.vectors[0], sigma=course * 1e-7)
-    record = dataclasses.replace(record, vectors=(varying, record.vectors[1]))
-    filter_setup = dataclasses.replace(
-        setup.FilterSetup.for_scenario(swaying(duration=2.0), states=False),
-        sigma={"mag": (1e-7, 2e-7, 3e-7)},
-        measurement_sigma_factor=2.0,
-    )
-    mag, acc = setup.modelled_record(record, filter_setup).vectors
-    np.testing.assert_allclose(np.sqrt(np.mean(mag.sigma_axes**2, axis=0)), [2e-7, 4e-7, 6e-7], rtol=1e-14)
-    np.testing.assert_allclose(mag.sigma_axes / mag.sigma_axes[0], (course / course[0])[:, None] * np.ones(3))
-    np.testing.assert_allclose(mag.sigma, np.sqrt(np.mean(mag.sigma_axes**2, axis=1)))
-    assert mag.anisotropic
-    np.testing.assert_allclose(acc.sigma, 0.1)
-    assert not acc.anisotropic
-
-
 def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
     record = scenarios.simulate(tracked(5.0), 1)
     whole = dataclasses.replace(record.vectors[0], sigma_axes=None, covariance=np.diag(STAR**2) + 1e-10)

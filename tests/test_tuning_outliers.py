@@ -171,19 +171,6 @@ def test_of_one_measurement_it_is_the_sum_of_both_likelihoods(kind, states):
     assert -objective.minus_log(objective.start)[0] == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.slow
-def test_noise_by_axis_that_is_the_same_for_all_axes_has_the_plain_mixture():
-    case, names = every_kind(), ("gyro.arw", "up.sigma", "tracker.sigma")
-    plain = tuning.contaminated_likelihood([case], KINDS, names, share=0.1)
-    filter_setup = dataclasses.replace(
-        KINDS, sigma={name: (sigma,) * 3 for name, sigma in (("sun", 1e-2), ("up", 0.2))}
-    )
-    other = tuning.contaminated_likelihood([case], filter_setup, names, share=0.1)
-    assert other.minus_log(other.start)[0] == pytest.approx(plain.minus_log(plain.start)[0], rel=1e-13)
-    for (_, probability), (_, expected) in zip(other.outliers(other.start), plain.outliers(plain.start), strict=True):
-        np.testing.assert_allclose(probability, expected, rtol=1e-9, atol=1e-12)
-
-
 GRADIENTS = {
     "plain": (None, ("gyro.arw", "up.sigma", "tracker.sigma")),
     "two passes": (None, ("gyro.arw", "up.sigma", "tracker.sigma", "sun.sigma", "north.sigma", "gyro.rrw")),
