@@ -25,13 +25,11 @@ from strapdown.motion import (
     SpinCone,
     SpinRock,
     TorqueFree,
-    harmonic,
     rest,
     torque_free,
     waypoints,
 )
 from strapdown.motion.exact_phase import DIGITS
-from strapdown.motion.quadrature import interval_integrals
 
 START = tuple(quaternion.exp([0.3, -1.1, 0.7]).tolist())
 RECORD = (0.0, 2.0)
@@ -548,26 +546,6 @@ def test_harmonic_attitude_of_a_small_vibration_gathers_no_rounding():
     assert quaternion.angle_between(truth.attitude(t), expected).max() < 2.5e-16
 
 
-def test_harmonic_attitude_against_mpmath():
-    truth = HarmonicRates(harmonics=elliptic_vibration(3.0, 2.0), mean=(0.5, 0.0, -1.0), initial_attitude=START)
-    with mpmath.workdps(22):
-        rate = mp_rate(truth)
-
-        def change(t, q):
-            w, (x, y, z), (a, b, c) = q[0], q[1:], rate(t)
-            twice = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
-            return [component / 2 for component in twice]
-
-        exact = mpmath.odefun(change, 0, [mpmath.mpf(x) for x in START], tol=mpmath.mpf(10) ** -19)(0.1)
-    assert np.abs(truth.attitude(0.1) - np.array([float(x) for x in exact])).max() < 5e-16
-
-
-def test_chained_nodes_keep_their_norm_without_normalisation():
-    truth = HarmonicRates(harmonics=elliptic_vibration(10.0, 1.0), mean=(0.1, -0.2, 0.05))
-    attitudes, lows = harmonic._chained(truth, truth._spacing, 1, 1 << 14)
-    assert np.abs(np.sum(attitudes**2 + 2.0 * attitudes * lows, axis=-1) - 1.0).max() < 2e-14
-
-
 # ---------------------------------------------------------------------------------------------------- sampled motions
 
 
@@ -714,19 +692,3 @@ def test_bad_breaks_are_refused(breaks, message):
     object.__setattr__(kicked, "breaks", breaks)
     with pytest.raises(InputError, match=message):
         Composed(base=rest(), vibration=kicked)
-
-
-def test_quadrature_of_a_rate_with_a_kink():
-    edges = np.array([0.0, 0.3, 1.0, 1.5])
-    kink = 0.6180339887
-
-    def rate(t):
-        return np.stack([np.maximum(t - kink, 0.0) ** 2, np.exp(np.sin(40.0 * t)), np.ones_like(t)], axis=-1)
-
-    got = interval_integrals(rate, edges, np.empty(0))
-    integrals = interval_integrals(rate, edges, np.array([kink]))
-    for k, (a, b) in enumerate(itertools.pairwise(edges)):
-        cube = (max(b - kink, 0.0) ** 3 - max(a - kink, 0.0) ** 3) / 3.0
-        wave = quad_vec(lambda t: np.exp(np.sin(40.0 * t)), a, b, epsabs=1e-15, epsrel=1e-14)[0]
-        assert np.abs(integrals[k] - [cube, wave, b - a]).max() < 3e-15 * (b - a) * math.e
-        assert np.abs(got[k] - [cube, wave, b - a]).max() < 1e-10 * (b - a)
