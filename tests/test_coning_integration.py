@@ -140,21 +140,6 @@ def test_a_constant_rate_is_off_by_a_few_roundings_of_its_total_angle(seed):
     assert error < 4 * math.sqrt(n) * 2.0**-53 + 8 * 2.0**-54 * n * float(angle)
 
 
-@pytest.mark.parametrize("n", [7, 40, kernels.BLOCK, kernels.BLOCK + 1, 3 * kernels.BLOCK + 77])
-@pytest.mark.parametrize("size", [0.01, 0.5])
-def test_plain_python_blocks_equal_the_compiled_ones(n, size):
-    generator = np.random.default_rng(n)
-    vectors = size * generator.standard_normal((n, 3))
-    steps = quaternion.exp(vectors)
-    initial = quaternion.exp(generator.standard_normal(3))
-    for kernel, rows in ((kernels.accumulate_vectors, vectors), (kernels.accumulate_quaternions, steps)):
-        plain, fast = np.zeros((2, n + 1, 4))
-        kernel(rows.reshape(-1), initial, np.empty(kernels.WORK), plain.reshape(-1))
-        compiled(kernel)(rows.reshape(-1), initial, np.empty(kernels.WORK), fast.reshape(-1))
-        np.testing.assert_allclose(fast, plain, rtol=0.0, atol=4e-16 * math.sqrt(n))
-        assert np.abs(np.linalg.norm(fast, axis=1) - 1.0).max() <= 4e-16
-
-
 @pytest.mark.parametrize("n", [1, 33, 1000])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_values_that_are_not_finite_are_named(n, bad):
