@@ -178,22 +178,6 @@ def test_a_rate_that_changes_within_an_interval_looks_like_a_scale_factor(share)
     assert scale == pytest.approx(-0.5 * share * (1.0 - share) * (frequency * step) ** 2, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.slow if len(CASES[case]) == 1 else []) for case in CASES]
-)
-def test_it_is_not_with_the_blocks_left_out(case):
-    verdict = judged(case, (), 10, 12.0)["all"]
-    assert verdict.outside == 5
-    assert np.all(verdict.mean > 1.5)
-
-
-def otherwise(block, **effect):
-    """A block with another effect on the magnetometer."""
-    names = {name: getattr(block, name) for name in ("name", "components", "units", "sigma")}
-    effects = {"mag": error_states.Effect(**effect)}
-    return type("Otherwise", (error_states.ErrorStates,), {**names, "effects": effects})()
-
-
 BROKEN = {
     "a prior too narrow": (0, {"scale_sigma": 0.002, "misalignment_sigma": 0.002}),
     "a drift too small": (1, {"bias_sigma": 1e-3}),
@@ -208,20 +192,6 @@ def test_it_is_not_with_a_block_broken(how):
     k, changes = BROKEN[how]
     blocks[k] = dataclasses.replace(blocks[k], **changes)
     assert wrong(judged("every kind", tuple(blocks), 40, 12.0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "block"),
-    [
-        ("hard iron", otherwise(IRON, offset_b=-np.eye(3))),
-        ("mounting", otherwise(MOUNTING, scale=-np.cross(np.eye(3)[:, None], np.eye(3)))),
-        ("mounting", dataclasses.replace(MOUNTING, sensor="force")),
-    ],
-    ids=["the wrong sign", "the inverse mounting", "a mounting of another sensor"],
-)
-def test_it_is_not_with_another_effect(case, block):
-    assert wrong(judged(case, (block,), 40, 12.0))
 
 
 @pytest.mark.parametrize("case", [pytest.param("mounting", marks=pytest.mark.slow), "every kind"])

@@ -21,10 +21,9 @@ from measured import (
 )
 
 from strapdown import estimation, kinematics, quaternion, records
-from strapdown.estimation import error_states, forward
+from strapdown.estimation import error_states
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
-from strapdown.estimation.model import assemble
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 
@@ -339,9 +338,6 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=0.05, rate_random_walk=1e-3)
 SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=0.4, frame="fixed")
-MOVED = error_states.BoundedVelocity(
-    sensor="acc", velocity_time=0.3, velocity_sigma=0.1, acceleration_time=0.1, strength=1.0
-)
 
 
 def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
@@ -506,39 +502,3 @@ def test_the_parts_about_a_recovery_keep_the_unit_of_the_start():
     assert len(recoveries(first)) == 1
     np.testing.assert_allclose(first.attitude, second.attitude, rtol=0, atol=1e-10)
     np.testing.assert_allclose(first.variance, second.variance, rtol=1e-7)
-
-
-@pytest.mark.slow
-def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
-    """What a new trajectory starts from: against the filter over a record without measurements."""
-    blocks = (IRON, SWAY, MOVED)
-    record, initial = swaying()
-    begun = estimation.with_error_states(initial, blocks)
-    values = np.arange(1.0, len(begun.values) + 1.0) * np.sqrt(np.diag(begun.covariance)[6:])
-    P = begun.covariance + np.diag(np.append(np.zeros(6), np.diag(begun.covariance)[6:]))
-    begun = dataclasses.replace(begun, values=values, covariance=P)
-    bare = dataclasses.replace(
-        record, vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors)
-    )
-    ahead = estimation.run(bare, NOISE, begun, blocks, full_covariance=True)
-    model = assemble(blocks, {series.sensor: series.kind for series in record.vectors})
-    aged, covariance = forward.aged_states(model, *forward.restart_states(begun, blocks), 2.0)
-    sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
-    expected = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
-    np.testing.assert_allclose(aged / sigma, expected / sigma, rtol=0, atol=1e-8)
-    scale = np.outer(sigma, sigma)
-    np.testing.assert_allclose(covariance / scale, ahead.whole_covariance[-1][6:, 6:] / scale, rtol=0, atol=1e-8)
-
-
-def test_lock_outs_are_reported():
-    """A sensor that is refused over and over with no way to follow it: the event is the smoother's too."""
-    record, _, initial = lost_start(1)
-    mag, acc = record.vectors
-    away = dataclasses.replace(mag, vector_b=-mag.vector_b)
-    record = dataclasses.replace(record, vectors=(away, acc))
-    start = dataclasses.replace(initial, attitude=record.truth.attitude[0])
-    gate = Gate(recovery=None)
-    ahead = estimation.run(record, NOISE, start, (STILL,), gate=gate)
-    both = estimation.smooth(record, NOISE, start, (STILL,), gate=gate)
-    assert [event.kind for event in ahead.events] == ["lock-out"]
-    assert both.events == ahead.events

@@ -444,17 +444,6 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
     assert whole.velocity_sigma == 0.5
 
 
-def test_a_setup_runs_it():
-    record, _ = record_of(block_of("velocity"))
-    filter_setup = setup.FilterSetup(process_noise=NOISE, bias_sigma=3e-3, states=States(sensors={"acc": TOLD}))
-    estimate = setup.run(record, filter_setup, start())
-    same = estimation.run(record, NOISE, start(), (dataclasses.replace(block_of("velocity"), name=""),))
-    np.testing.assert_allclose(estimate.attitude, same.attitude, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(
-        estimate.error_states["acc velocity"].values, same.error_states["acc velocity"].values, atol=1e-10
-    )
-
-
 def test_what_no_state_covers_is_reported():
     moved = Accelerometer(name="acc", sigma=0.05, rate=25.0, acceleration_f=lambda t: np.zeros((*np.shape(t), 3)))
     held = dataclasses.replace(moved, acceleration_f=None)
@@ -492,38 +481,6 @@ def test_the_simulated_hand_moves_as_its_accelerometer_says():
     fixed = quaternion.rotate(recording.true_attitude, recording.specific_force) - np.array([0.0, 0.0, 9.81])
     assert np.abs(fixed[recording.time < 1.9].mean(axis=0)).max() < 0.2
     assert 0.3 < np.sqrt(np.mean(fixed[recording.time > 4.0] ** 2)) < 3.0
-
-
-BOUNDED = dataclasses.replace(
-    ahrs.HAND_HELD, gyro_scale_sigma=0.0, hard_iron_sigma=0.0, accelerometer_bias_sigma=0.0, velocity_sigma=1.0
-)
-
-
-def coloured(recording: Recording) -> dict[str, float]:
-    """Errors with the acceleration as coloured noise of first order, of the σ and high-frequency spectrum of the bounded velocity's."""
-    white = dataclasses.replace(BOUNDED, velocity_sigma=0.0, specific_force_noise=0.06)
-    plain = ahrs.estimate(recording, white, latency=0.0)
-    acceleration = error_states.GaussMarkov(
-        sensor="accelerometer", noise_sigma=5.8, correlation_time=0.1, frame="fixed", unit="m/s²", name="acceleration"
-    )
-    estimate = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (acceleration,))
-    rows = np.searchsorted(plain.recording.time, plain.record.time)
-    return errors_of(plain.recording.taken(rows), estimate.attitude)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("other", ["white", "coloured"])
-def test_a_simulated_hand_is_better_known_by_its_bounded_velocity(other):
-    """On smooth paths that are not the block's own model; the means of four."""
-    inclination: dict[str, list[float]] = {other: [], "bounded": []}
-    for run in range(4):
-        recording = hand_held.simulated(1, run, 30.0)
-        quiet = dataclasses.replace(ahrs.AhrsParameters(), rest_bias_sigma=ahrs.HAND_HELD.rest_bias_sigma)
-        errors = errors_by(recording, quiet) if other == "white" else coloured(recording)
-        inclination[other].append(errors["inclination"])
-        inclination["bounded"].append(errors_by(recording, BOUNDED)["inclination"])
-    mean = {name: np.mean(values) for name, values in inclination.items()}
-    assert mean["bounded"] < 0.95 * mean[other], mean
 
 
 def test_the_latency_of_a_gyro_beside_a_reference():

@@ -440,23 +440,6 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
 
 
-def test_after_directions_at_random_that_no_candidate_can_follow_it_is_right_again() -> None:
-    record, initial = far_off(1)
-    rng = np.random.default_rng(1)
-    vectors = []
-    for s in record.vectors:
-        z = rng.standard_normal((len(s.time), 3))
-        z /= np.linalg.norm(z, axis=1, keepdims=True)
-        vectors.append(dataclasses.replace(s, vector_b=np.where((s.time < 0.6)[:, None], z, s.vector_b)))
-    record = dataclasses.replace(record, vectors=tuple(vectors))
-    smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-    (event,) = recoveries(smoothed)
-    assert event.start < 0.1
-    after = record.time > 0.7
-    assert event.end > 0.8
-    assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[after]) < 5.0
-
-
 def test_several_recoveries_and_a_record_in_parts() -> None:
     """The second part begins while the filter is lost: what took over then begins with the part at the earliest."""
     record, initial = far_off(1)
