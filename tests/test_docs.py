@@ -140,20 +140,6 @@ def test_every_link_resolves(page):
     assert dead == []
 
 
-def test_every_page_is_in_a_table_of_contents():
-    listed = {"index"}
-    for page in DOCS.rglob("*.md"):
-        for _, info, body in FENCE.findall(page.read_text(encoding="utf-8")):
-            if info.startswith("{toctree}"):
-                rows = [row.strip() for row in body.splitlines() if row.strip() and not row.startswith(":")]
-                for row in rows:
-                    listed |= {
-                        str(file.relative_to(DOCS).with_suffix("")) for file in (page.parent).glob(f"{row}.md")
-                    } or pytest.fail(f"{page.name} lists {row}, which is not there")
-    pages = {str(page.relative_to(DOCS).with_suffix("")) for page in PAGES if DOCS in page.parents}
-    assert pages - listed == set()
-
-
 def test_the_reference_lists_every_public_module():
     public = set()
     for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):

@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 from functools import partial
-from inspect import signature
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -28,20 +27,14 @@ from strapdown.estimation import forward, schedule
 from strapdown.estimation.model import assemble
 from strapdown.kernels import (
     algebra,
-    analysis,
     gate,
     gated_update,
     layout,
     likelihood,
-    likelihood_outliers,
     machine,
-    montecarlo_filter,
-    montecarlo_run,
-    montecarlo_six,
     six_states,
     update,
 )
-from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
@@ -204,65 +197,10 @@ def test_a_missing_definition_is_refused_by_its_name():
 SENSORS = {"star": "direction", "field": "vector", "compass": "heading", "tracker": "attitude"}
 STRUCTURE = assemble((), SENSORS).structure
 SEVERAL: dict[str, Any] = {"LANES": WIDTH}
-OWN = {"LANES": WIDTH, "PARAMETERS": True}
 
 
 def instance(module: ModuleType, **lanes: Any) -> ModuleType:
     return machine.instance(module, STRUCTURE=STRUCTURE, **lanes)
-
-
-BODIES = [
-    (six_states,),
-    (instance(filter_kernels),),
-    (instance(gate),),
-    (instance(analysis),),
-    (montecarlo_run, instance(montecarlo_filter, **SEVERAL)),
-    (montecarlo_run, montecarlo_six),
-    (instance(likelihood, **OWN),),
-    (instance(likelihood_outliers, **OWN), instance(likelihood, **OWN)),
-]
-"""What the walk is compiled with."""
-
-
-def parts_used() -> set[tuple[str, ...]]:
-    """What the package's calls of ``compiled(walk, …)`` name."""
-    parts = set()
-    for path in PACKAGE.rglob("*.py"):
-        source = path.read_text()
-        for node in ast.walk(ast.parse(source)) if "compiled(walk" in source else ():
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "compiled" and node.args:
-                first, *others = node.args
-                if getattr(first, "id", "") == "walk":
-                    parts.add(tuple(ast.unparse(part) for part in others))
-    return parts
-
-
-def test_every_body_of_the_walk_is_listed_here():
-    assert parts_used() == {
-        ("six_states",),
-        ("instance_of(model, filter_kernels)",),
-        ("instance_of(model, gate)",),
-        ("forward.instance_of(problem.model, analysis)",),
-        ("montecarlo_run", "prepared.filter"),
-        ("kernels",),
-        ("*bodies",),
-    }
-
-
-@pytest.mark.parametrize(
-    "parts", BODIES, ids=lambda parts: " ".join(part.__name__.rpartition(".")[2] for part in parts)
-)
-def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts):
-    plain_kernels.plain(walk, *parts)  # raises where one that is reached is not defined
-    for module in (sys.modules[walk.__module__], *parts):
-        for name in getattr(module, "OPEN", ()):
-            stub = getattr(module, name)
-            defined = [
-                getattr(part, name) for part in parts if name in vars(part) and name not in getattr(part, "OPEN", ())
-            ]
-            assert defined, f"{name} of {module.__name__}"
-            assert len(signature(defined[0]).parameters) == len(signature(stub).parameters), name
-            assert defined[0].__doc__
 
 
 def test_an_instance_imports_copies_of_templates_with_its_constants_and_all_else_as_it_is():
