@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import ahrs, allan, gyro, recordings, scenarios, units, workflows
+from strapdown import ahrs, allan, gyro, recordings, units, workflows
 from strapdown.allan import noise_fit
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
@@ -287,63 +287,6 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succe
     assert (
         estimate.sigma[-1, 3] < 6e-4
     )  # of 9e-4 after that second; the velocity of a hand without magnetometer has a σ of 3 m/s
-
-
-def through_a_bag(folder, seed: int, others: float) -> tuple[np.ndarray, list[bool]]:
-    """Return whether the intervals of a simulated unit that went through a ROS 2 bag hold the truth: by term and axis, and of imu.yaml.
-
-    Half a minute of white noise and random walk, ``others`` of it on the axes y and z; fitted are all terms, as the command does.
-    """
-    share = np.array([1.0, others, others])
-    truth = {"gyro": (1e-3 * share, 2e-3 * share), "accelerometer": (2e-3 * share, 5e-3 * share)}  # N and K
-    units = [
-        scenarios.Scenario(
-            motion=scenarios.load_scenario("rest").motion,
-            gyro=gyro.GyroSpec(angle_random_walk=tuple(N), rate_random_walk=tuple(K)),
-            sensors=(),
-            rate=100.0,
-            duration=30.0,
-        )
-        for N, K in truth.values()
-    ]
-    # An accelerometer's two noises are those of a gyro, in its own unit.
-    turning, pulling = (recordings.from_record(scenarios.simulate(unit, 2 * seed + k)) for k, unit in enumerate(units))
-    path = folder / f"{seed}.mcap"
-    recordings.write(replace(turning, specific_force=pulling.rate + np.array([0.0, 0.0, STANDARD_GRAVITY])), path)
-    fits, axes, numbers = {}, [], []
-    for sensor in truth:
-        samples = recordings.read_samples(path, sensor)
-        fits[sensor] = allan.fit_noise(samples.values, samples.sample_interval)
-    path.unlink()
-    text = noise_parameters.to_kalibr(fits)
-    for (sensor, fit), own in zip(fits.items(), ("gyroscope", "accelerometer"), strict=True):
-        for term, name, value in zip(
-            ("angle_random_walk", "rate_random_walk"), ("noise_density", "random_walk"), truth[sensor], strict=True
-        ):
-            i = fit.terms.index(term)
-            axes.append((fit.lower[:, i] <= value) & (value <= fit.upper[:, i]))
-            low, high = re.search(rf"{own}_{name}: .* 95 % interval (\S+) to (\S+?)(?:;.*)?\n", text).groups()
-            numbers.append(float(low) <= value.max() <= float(high))
-    return np.array(axes), numbers
-
-
-def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path):
-    pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 0.2) for seed in range(2)), strict=True)
-    assert 19 <= np.sum(axes) <= 24  # of 24 at 95 %: 22.8, σ 1.1
-    assert 6 <= np.sum(numbers) <= 8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("others", [1.0, 0.2], ids=["axes alike", "one much larger"])
-def test_a_simulated_unit_through_a_bag_is_covered(tmp_path, others):
-    """200 runs of gyro and accelerometer with two coefficients each, of the axes and of imu.yaml: 95 ± 2 %, with all terms fitted."""
-    pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    axes, numbers = zip(*(through_a_bag(tmp_path, seed, others) for seed in range(200)), strict=True)
-    for inside in (axes, numbers):
-        assert 0.93 <= np.mean(inside) <= 0.97
-    assert (np.mean(axes, axis=(0, 2)) >= 0.92).all()
-    assert (np.mean(axes, axis=(0, 2)) <= 0.98).all()
 
 
 @pytest.mark.parametrize(("axes", "others"), [(1, 1.0), (3, 1.0), (3, 0.2)], ids=["one", "alike", "one much larger"])
