@@ -302,17 +302,6 @@ def test_few_runs_cannot_tell():
     assert starved.judge().verdict == "cannot tell"
 
 
-def test_a_mean_error_is_reported():
-    good = statistics_of()
-    shift = 0.5 * good.rms_error[:, 5]
-    square = good.error_product_sum.copy()
-    square[:, 5, 5] += good.runs * shift**2
-    moved = good.error_sum.copy()
-    moved[:, 5] += good.runs * shift
-    judged = replace(good, error_sum=moved, error_product_sum=square).judge()
-    assert [(f.name, f.of) for f in judged.findings if f.rejected] == [("mean error", "bias z")]
-
-
 def test_runs_that_failed_are_not_consistent():
     good = statistics_of()
     finite = good.finite.copy()

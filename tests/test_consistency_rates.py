@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from spin_plan import PLAN
-from two_stars import stars
 
 from benchmarks import power
-from strapdown import consistency, estimation, montecarlo, motion, scenarios, units, vectors
+from strapdown import consistency, montecarlo, motion, scenarios, units, vectors
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import scalar, statistics
-from strapdown.records import Truth
 
 
 def within_binomial(p_values, sigmas):
@@ -44,28 +42,11 @@ def test_statistics_of_one_run(few, statistic):
     within_binomial(few[statistic], 4.0)
 
 
-def test_ljung_box_has_its_size():
-    """4 to 6 % at a nominal 5 %."""
-    random = np.random.default_rng(2)
-    for samples, components in ((300, 2), (500, 1)):
-        refused = [consistency.ljung_box(random.standard_normal((samples, components)))[2] < 0.05 for _ in range(4000)]
-        assert 0.04 < np.mean(refused) < 0.06
-
-
 @pytest.mark.parametrize(("runs", "n"), [(50, 6), (20, 3)])
 def test_statistics_of_many_runs(runs, n):
     white = np.random.default_rng(3).standard_normal((3000, runs, n))
     for p in power.many_run_p_values(white).values():
         within_binomial(p, 4.0)
-
-
-def test_autocorrelation_bounds_hold():
-    random = np.random.default_rng(4)
-    outside = 0
-    for _ in range(2000):
-        correlation = consistency.autocorrelation(random.standard_normal((500, 1)), 0.95)
-        outside += np.any(np.abs(correlation.values[:, 0]) > correlation.bounds)
-    assert abs(outside / 2000 - 0.05) < 0.02
 
 
 def test_no_run_of_right_filters_is_beyond_chance(monkeypatch):
@@ -103,55 +84,6 @@ def test_ten_thousand_right_filters():
         within_binomial(p, 3.0)
 
 
-def right_run(seed):
-    """Estimate and truth of one right filter on a slow spin with two stars."""
-    scenario = scenarios.Scenario(
-        motion=motion.SpinRock(
-            rock_angle=10.0 * units.DEGREE, rock_frequency=0.1, spin_rate=5.0 * units.DEGREE, rock_phase=0.0
-        ),
-        gyro=GyroSpec(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
-        sensors=stars(1e-4, 1e-4, rate=2.0),
-        rate=10.0,
-        duration=300.0,
-    )
-    record = scenarios.simulate(scenario, seed=seed)
-    filter_setup = setup.FilterSetup(
-        process_noise=estimation.ProcessNoise(
-            angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6
-        ),
-        attitude_sigma=1e-3,
-        bias_sigma=1e-5,
-    )
-    initial = montecarlo.start(record, filter_setup, seed, 0)
-    estimate = setup.run(record, filter_setup, initial, every=5, full_covariance=True)
-    return estimate, Truth(attitude=record.truth.attitude[::5], bias=record.truth.bias[::5])
-
-
-def refused(seeds, probability):
-    """How many right runs are called not consistent, and how often each finding alone is below 1 %."""
-    wrong, alone = 0, {}
-    for seed in seeds:
-        judgement = consistency.judge(*right_run(seed), confidence_level=probability)
-        wrong += judgement.verdict == "not consistent"
-        for finding in judgement.findings:
-            alone.setdefault((finding.name, finding.of), []).append(finding.p_value)
-    return wrong, alone
-
-
-def test_the_real_filter_is_seldom_called_wrong():
-    wrong, _ = refused(range(8), 0.99)
-    assert wrong <= 2
-
-
-@pytest.mark.slow
-def test_the_real_filter_a_thousand_times():
-    wrong, alone = refused(range(1000), 0.95)
-    assert wrong <= 50 + 3 * np.sqrt(1000 * 0.05 * 0.95)
-    assert wrong >= 10  # Holm is conservative, not idle
-    for p_values in alone.values():
-        within_binomial(np.array(p_values), 3.5)
-
-
 def satellite(duration=300.0):
     """A datasheet with bias instability and scale factor; the filter that matches it by default has states for both."""
     scenario = scenarios.Scenario(
@@ -169,29 +101,6 @@ def satellite(duration=300.0):
         rate=50.0,  # at 5 Hz the states for flicker are 2 % too careful
         duration=duration,
         gravity_f=(0.0, 0.0, 0.0),
-    )
-    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-    return montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=50, individuals=True)
-
-
-@pytest.mark.slow
-def test_the_bias_is_consistent_from_the_first_second():
-    """A filter that takes the initial bias for that of its states has a NEES of 1.24: the fast part of flicker is not in them."""
-    runs = montecarlo.run_plan(satellite(5.0), runs=300, threads=1)
-    bias = runs.anees[:, runs.subsets.index("bias")]
-    low, high = consistency.mean_bounds(3, 300, 0.999)
-    assert low < bias[0] < high
-    assert low < bias[np.searchsorted(runs.time, 1.0)] < high
-
-
-def coloured(correlation_time):
-    """A tracker whose noise is half coloured, with states for that."""
-    base = satellite(100.0).scenario
-    faults = vectors.Faults(correlated_sigma=5.0 * units.ARCSECOND, correlation_time=correlation_time)
-    scenario = replace(
-        base,
-        sensors=(replace(base.sensors[0], faults=faults),),
-        gyro=GyroSpec(angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=2.4e-8),
     )
     filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     return montecarlo.Plan(scenario=scenario, setup=filter_setup, epochs=50, individuals=True)
@@ -222,15 +131,6 @@ def test_few_campaigns_of_a_right_filter_are_called_wrong():
     verdicts = verdicts_of_campaigns(20, 160)
     assert verdicts.count("not consistent") <= 2
     assert verdicts.count("consistent") >= 18  # and 160 runs suffice
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("plan", "seconds"), [(satellite, 100.0), (coloured, 50.0)], ids=["flicker and scale", "coloured tracker"]
-)
-def test_few_runs_of_a_filter_with_states_are_called_wrong(plan, seconds):
-    """More than two of thirty have a probability of 0.003 at the nominal 1 %, and of 0.96 at 20 %."""
-    assert verdicts_of_runs(plan(seconds), 30).count("not consistent") <= 2
 
 
 @pytest.mark.slow

@@ -302,14 +302,6 @@ def test_log_p_goes_on_where_the_function_underflows(degrees):
     assert log_p(-1.0, degrees) == 0.0
 
 
-def test_the_summary_is_plain():
-    explanation = diagnosed(LATE, 0)
-    cause = json.loads(json.dumps(explanation.summary(), allow_nan=False))["causes"][0]
-    assert (cause["name"], cause["significant"], cause["unit"]) == ("time offset", True, "s")
-    assert "too late" in explanation.words
-    assert len(explanation.considered) > len(explanation.causes)
-
-
 def test_a_record_without_measurements_in_its_time_is_refused():
     record = scenarios.simulate(scenario(duration=5.0), seed=0)
     initial = start(record, RIGHT, 0, 0)

@@ -334,6 +334,11 @@ TABLE = [
     (changed_setup, {"integration": "four-sample"}, "integration is"),
     (changed_setup, {"process_noise": 1e-4}, "process_noise is"),
     (sd.covariance_analysis, {"scenario": "spin", "setup": "mine"}, "setup is 'mine', not of class FilterSetup"),
+    (
+        sd.monte_carlo,
+        {"scenario": "two-stars", "runs": 2, "setup": "mekf"},
+        "setup is 'mekf', not of class FilterSetup",
+    ),
     (sd.covariance_analysis, {"scenario": "spin", "consider": {"scale_factor": 1e-4}}, "not of class Consider"),
     (sd.monte_carlo, {"scenario": "spin", "dispersions": {"bias_sigma": 1.0}}, "not of class Dispersions"),
     (lambda: replace(scenarios.load_scenario("spin"), gyro=1e-4), {}, "gyro is 0.0001, not of class GyroSpec"),

@@ -614,16 +614,3 @@ def test_lost_samples_and_jitter_go_through_too():
     assert len(again.record.increments) < 240
     rows = np.searchsorted(again.estimate.time, lossy.time + 1e-6, side="right") - 1
     assert np.array_equal(errors_at(again.estimate, again.record.truth, rows), total.example_error[3])
-
-
-def test_what_the_motion_is_remembered_to_say_is_what_it_says():
-    remembered = scalar._Remembered(SCENARIO.motion)
-    for times in (np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 8), 0.25, np.linspace(0.0, 1.0, 7)):
-        for what in ("attitude", "body_rate", "body_angular_acceleration"):
-            assert np.array_equal(getattr(remembered, what)(times), getattr(SCENARIO.motion, what)(times))
-    assert np.array_equal(remembered.increments([0.0, 0.1]), SCENARIO.motion.increments([0.0, 0.1]))
-    for k in range(100):
-        remembered.attitude(float(k))
-    assert remembered._cached.cache_info().currsize <= 32
-    with pytest.raises(ValueError, match="read-only"):
-        remembered.attitude(99.0)[0] = 1.0
