@@ -890,36 +890,31 @@ def late(gyro: float = 0.0, field: float = 0.0, bias: tuple[float, ...] = (0.0, 
     )
 
 
-@pytest.mark.parametrize("behind", [-0.008, 0.0, 0.011, 0.03])
-def test_how_late_the_magnetometer_is_shows_beside_the_gyro(behind):
-    delay, sigma = sensor_delays.magnetometer_delay(late(field=behind))
-    assert sigma < 3e-4
-    assert delay == pytest.approx(behind, abs=5e-4)
-    used = delay if behind else 0.0  # not within 3 σ of zero
-    assert np.all(sensor_delays.find(late(field=behind)).field == used)
-
-
-@pytest.mark.parametrize("behind", [-0.2, 0.1, 0.2])
-def test_a_long_delay_of_the_magnetometer_is_found_and_compensated(behind):
-    """Beyond the linear fit, which takes 0.2 s for a few milliseconds with a small σ."""
+@pytest.mark.parametrize(
+    ("behind", "every", "most", "off"),
+    [
+        *((behind, 1, 3e-4, 5e-4) for behind in (-0.008, 0.0, 0.011, 0.03)),
+        *((behind, 1, 3e-4, 1e-3) for behind in (-0.2, 0.1, 0.2)),  # of which the linear fit makes a few milliseconds
+        *((behind, every, 1e-3, 2e-3) for behind in (0.0, 0.011, 0.2) for every in (3, 5)),  # slower than the gyro
+    ],
+)
+def test_how_late_the_magnetometer_is_shows_beside_the_gyro(behind, every, most, off):
     shown = late(field=behind)
-    delay, sigma = sensor_delays.magnetometer_delay(shown)
-    assert sigma < 3e-4
-    assert delay == pytest.approx(behind, abs=1e-3)
-    used = sensor_delays.find(shown, causal=True).field
-    np.testing.assert_allclose(used, behind, atol=0.02)  # from the first sample on
-    assert used[-1] == pytest.approx(behind, abs=1e-3)
-
-
-@pytest.mark.parametrize("behind", [0.0, 0.011, 0.2])
-@pytest.mark.parametrize("every", [3, 5])
-def test_the_delay_of_a_magnetometer_slower_than_the_gyro_is_found(behind, every):
-    shown = late(field=behind)
-    field = np.full_like(shown.magnetic_field, np.nan)
-    field[1::every] = shown.magnetic_field[1::every]
+    field, measured_at = np.full_like(shown.magnetic_field, np.nan), slice(int(every > 1), None, every)
+    field[measured_at] = shown.magnetic_field[measured_at]
     delay, sigma = sensor_delays.magnetometer_delay(dataclasses.replace(shown, magnetic_field=field))
-    assert sigma < 1e-3
-    assert delay == pytest.approx(behind, abs=2e-3)
+    assert sigma < most
+    assert delay == pytest.approx(behind, abs=off)
+    if off == 5e-4:
+        assert np.all(sensor_delays.find(shown).field == (delay if behind else 0.0))  # not within 3 σ of zero
+
+
+@pytest.mark.parametrize("behind", [-0.2, 0.0, 0.1, 0.2])
+def test_a_delay_of_the_magnetometer_is_compensated(behind):
+    """From the first sample on."""
+    used = sensor_delays.find(late(field=behind), causal=True).field
+    np.testing.assert_allclose(used, behind, atol=0.02 if behind else 0.0)
+    assert used[-1] == pytest.approx(behind, abs=1e-3)
 
 
 def test_a_long_delay_that_the_motion_does_not_refine_is_reported_with_its_sigma():
