@@ -12,6 +12,7 @@ import strapdown as sd
 from sims import hand_held
 from strapdown import (
     ahrs,
+    calibration,
     coning,
     consistency,
     estimation,
@@ -502,6 +503,16 @@ def test_gate_robust_weights_and_observability_of_a_recording(succeeds, recordin
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert all(innovations.weight is not None for innovations in estimate.innovations.values())
     assert off(tmp_path / "out", 0.0) < 1.5
+
+
+def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
+    succeeds("estimate", recording, "--out", tmp_path / "first", "--smooth")
+    first = calibration.read(tmp_path / "first" / "calibration.toml")
+    again = ("--calibration", tmp_path / "first" / "calibration.toml")
+    succeeds("estimate", recording, "--out", tmp_path / "again", *again)
+    second = calibration.read(tmp_path / "again" / "calibration.toml")
+    assert second.gyro_scale_sigma < first.gyro_scale_sigma < 4e-3  # of the smoother's prior
+    assert np.abs(second.gyro_matrix - first.gyro_matrix).max() < 2e-3
 
 
 def test_a_clipped_gyro_and_a_hand_that_never_rests_are_reported(succeeds, recording, tmp_path):
