@@ -79,6 +79,7 @@ def random_covariances(generator, shape, n=6):
         *((lambda p=p: consistency.mean_bounds(6, 10, p), "confidence_level") for p in (0.0, 1.0, 1.5)),
         *((lambda s=s: consistency.nees(np.zeros(6), np.eye(6), s), "states") for s in ((), (0, 0), (6,), (-1,))),
         (lambda: consistency.anderson_darling(np.ones(20)), "do not vary"),
+        (lambda: consistency.errors(*(np.ones((n, k)) for n, k in ((3, 4), (3, 3), (2, 4), (2, 3)))), "same times"),
         (
             lambda: consistency.nees(np.zeros((2, 2)), [np.eye(2), np.diag([1.0, -1.0])]),
             r"covariance\[1\] is not positive",
