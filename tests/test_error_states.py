@@ -687,21 +687,3 @@ def test_the_kernels_are_compiled_once_for_a_structure():
         estimation.smooth(_laid_out_otherwise(record), NOISE, start(), others)
         assert [dispatcher.signatures for dispatcher in dispatchers] == compiled
         assert all(compiled)
-
-
-@pytest.mark.parametrize(
-    ("prior", "sigma", "bound"), [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)], ids=["1 arcsecond", "anywhere, 0.2 arcseconds"]
-)
-def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
-    """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""
-    series = tuple(
-        series_of(name, "vector", [0.0], [axis], axis, sigma) for name, axis in zip("xy", np.eye(3), strict=False)
-    )
-    start_at = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=prior, bias_sigma=1.0)
-    blocks = every_kind(gyro_scale={"scale_sigma": 1.0, "misalignment_sigma": 1.0})
-    estimate = estimation.run(resting(*beside_silent(*series)), NOISE, start_at, blocks, full_covariance=True)
-    P = estimate.whole_covariance[0]
-    expected = np.diag(1.0 / (np.array([1.0, 1.0, 2.0]) / sigma**2 + 1.0 / prior**2))
-    np.testing.assert_allclose(P[:3, :3], expected, rtol=bound, atol=bound * sigma**2)
-    prior_of_the_rest = estimation.with_error_states(start_at, blocks).covariance[3:, 3:]
-    np.testing.assert_allclose(P[3:, 3:], prior_of_the_rest, rtol=1e-14, atol=1e-14)

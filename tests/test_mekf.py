@@ -6,14 +6,12 @@ import in_steps
 import numpy as np
 import pytest
 from filterpy.common import Saver
-from measured import record_of, resting, series_of
+from measured import resting, series_of
 
 from strapdown import consistency, estimation, gyro, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import PRIOR_INFLATION, ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.kernels import measurement
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements, VectorSensor
@@ -91,43 +89,6 @@ def test_steady_state_is_farrenkopfs_closed_form():
     for axis in (1, 2):  # the axes that the fixed x direction shows
         assert after[axis, axis] == pytest.approx(sigma**2 * (1.0 - zeta**-2), rel=1e-9)
         assert after[3 + axis, 3 + axis] == pytest.approx(bias, rel=1e-9)
-
-
-def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
-    """The measured attitude, with its covariance carried to the estimate's tangent space; its NIS has three degrees of freedom."""
-    sigma = np.array([1e-3, 2e-3, 3e-3])
-    measured = quaternion.exp([0.3, -0.2, 0.5])
-    series = VectorMeasurements(sensor="t", kind="attitude", time=[0.0], attitude=[measured], sigma_axes=sigma)
-    record = resting(series)
-    start = quaternion.multiply(measured, quaternion.exp([1e-3, 1e-3, -1e-3]))
-    initial = initial_state(start, attitude_sigma=1e2, bias_sigma=1.0)
-    result = estimation.run(record, NOISE, initial, full_covariance=True)
-    assert quaternion.angle_between(result.attitude[0], measured) < 1e-10
-    assert np.allclose(result.covariance[0, :3, :3], np.diag(sigma**2), rtol=2e-3, atol=1e-8)
-    assert result.innovations["t"].whitened.shape == (1, 3)
-
-
-def test_scaled_noise_reaches_every_kind():
-    record = record_of(duration=2.0)
-    modelled = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
-    plain, scaled = schedule(record.vectors, 0.0, 2.0), schedule(modelled.vectors, 0.0, 2.0)
-    attitude = plain.kind == measurement.ATTITUDE
-    assert np.allclose(scaled.variance, 9.0 * plain.variance, rtol=1e-14)
-    assert np.allclose(scaled.vector_b[attitude], 9.0 * plain.vector_b[attitude], rtol=1e-14)
-    assert np.array_equal(scaled.vector_b[~attitude], plain.vector_b[~attitude])
-
-
-def test_one_interval_or_many_at_constant_rate_are_the_same():
-    """The model is exact at constant rate: a turn of 3 rad in one interval (sub-steps) equals a thousand small ones."""
-    turn = np.array([1.0, -2.0, 2.0])
-    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    coarse = estimation.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
-    many = ImuRecord(time=np.linspace(0.0, 1.0, 1001), increments=np.tile(turn / 1000.0, (1000, 1)))
-    fine = estimation.run(many, NOISE, initial, every=1000, full_covariance=True)
-    assert quaternion.angle_between(coarse.attitude[-1], fine.attitude[-1]) < 1e-13
-    assert quaternion.angle_between(coarse.attitude[-1], quaternion.exp(turn)) < 1e-14
-    d = np.sqrt(np.diag(coarse.covariance[-1]))
-    assert np.abs((coarse.covariance[-1] - fine.covariance[-1]) / np.outer(d, d)).max() < 1e-11
 
 
 def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():

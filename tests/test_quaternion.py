@@ -53,6 +53,8 @@ def test_leading_axes_broadcast():
     assert quaternion.rotate(p[:0], random_vectors((1, 1))).shape == (0, 1, 3)
     assert quaternion.rotate(p[0, 0], random_vectors(())).shape == (3,)
     assert quaternion.angle_between(p, q).shape == (2, 3)
+    assert quaternion.exp(quaternion.log(p)).shape == (2, 1, 4)
+    assert quaternion.from_matrix(quaternion.to_matrix(quaternion.exp(quaternion.log(p[:0])))).shape == (0, 1, 4)
 
 
 def test_identity_cannot_be_written_to():
@@ -73,14 +75,7 @@ def test_matrix_and_rotation_agree_with_scipy(shape):
     close(quaternion.to_rotation(flat).as_matrix(), theirs.as_matrix())
     close(np.abs(np.sum(quaternion.from_rotation(theirs) * flat, -1)), np.ones(len(flat)))
     close(quaternion.from_rotation(quaternion.to_rotation(flat[0])), flat[0])
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_matrix_round_trip(shape):
-    q = random_quaternions(shape)
-    back = quaternion.from_matrix(quaternion.to_matrix(q))
-    assert np.all(back[..., 0] >= 0.0)
-    close(back, np.where(q[..., :1] < 0.0, -q, q))
+    close(quaternion.from_matrix(quaternion.to_matrix(q)), np.where(q[..., :1] < 0.0, -q, q))
 
 
 def test_from_matrix_at_half_turns_and_near_each_axis():
@@ -129,19 +124,10 @@ def test_exp_against_mpmath_over_all_angles(rotation_vectors):
 
 def test_log_against_mpmath_over_all_angles(rotation_vectors):
     q = quaternion.exp(np.concatenate([rotation_vectors(150), rotation_vectors(50, 1e-200, 1e-12)]))
+    q[::2] *= -1.0
     with mpmath.workdps(60):
         wanted = np.array([[float(c) for c in mp_log(row)] for row in q])
     assert np.all(np.linalg.norm(quaternion.log(q) - wanted, axis=1) <= 4 * EPS * np.linalg.norm(wanted, axis=1))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_exp_and_log_are_inverse(shape, rotation_vectors):
-    phi = rotation_vectors(64, 1e-12, 3.1)[: max(1, int(np.prod(shape)))]
-    phi = phi[: int(np.prod(shape))].reshape(*shape, 3)
-    q = quaternion.exp(phi)
-    assert q.shape == (*shape, 4)
-    np.testing.assert_allclose(quaternion.log(q), phi, rtol=16 * EPS, atol=0.0)
-    np.testing.assert_allclose(quaternion.log(-q), phi, rtol=16 * EPS, atol=0.0)
 
 
 def test_log_takes_the_shorter_way_round():
