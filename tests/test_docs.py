@@ -140,6 +140,16 @@ def test_every_link_resolves(page):
     assert dead == []
 
 
+def test_every_page_is_in_a_table_of_contents():
+    listed = {DOCS / "index.md"}
+    for page in DOCS.rglob("*.md"):
+        for _, info, body in FENCE.findall(page.read_text(encoding="utf-8")):
+            if info.startswith("{toctree}"):
+                rows = [row.strip() for row in body.splitlines() if row.strip() and not row.startswith(":")]
+                listed |= {page.parent / f"{row}.md" for row in rows}
+    assert {page for page in PAGES if DOCS in page.parents} == listed
+
+
 def test_the_reference_lists_every_public_module():
     public = set()
     for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):
