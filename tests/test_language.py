@@ -4,8 +4,6 @@ import re
 import symtable
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 PLACES = ("README.md", "strapdown/**/*.py", "docs/**/*.py", "docs/**/*.md", "sims/*.py", "benchmarks/*.py")
 FILES = sorted(path for place in PLACES for path in ROOT.glob(place) if "_build" not in path.parts)
@@ -61,21 +59,3 @@ def test_names_say_what_a_value_is():
 def test_prose_and_names_are_the_fields():
     findings = {str(path.relative_to(ROOT)): dialect(path.read_text(encoding="utf-8")) for path in FILES}
     assert {path: words for path, words in findings.items() if words} == {}
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "the filter is told",
-        "M_told",
-        "what it believes",
-        "is taken in",
-        "by so much",
-        "it is taken for one draw",
-        "what a correction makes of the states",
-        "LEAST_SIGMA = 1",
-        "too sure of itself",
-    ],
-)
-def test_the_dialect_is_recognised(text):
-    assert dialect(text)
