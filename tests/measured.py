@@ -1,4 +1,4 @@
-"""What many tests are made of: bodies, references, series of measurements, records at rest, starts drawn from their own σ, and errors."""
+"""What many tests are made of: bodies, references, measurements, recordings, records at rest, starts drawn from their own σ, errors."""
 
 from dataclasses import fields, is_dataclass, replace
 
@@ -186,6 +186,31 @@ def walk(n=60, epoch=1_700_000_000_123_456_789, single=False) -> Recording:
         true_attitude=quaternion.exp(np.cumsum(0.02 * random.standard_normal((n, 3)), axis=0)),
         movement=random.random(n) > 0.5,
         epoch_ns=epoch // 1000 * 1000 if single else epoch,
+    )
+
+
+def rates(time, path) -> np.ndarray:
+    """Return the body rate of a path by fourth-order differences of SciPy's rotations."""
+    h = 1e-3
+    here = path(time)
+
+    def turned(step):
+        return (here.inv() * path(time + step)).as_rotvec()
+
+    return (8.0 * (turned(h) - turned(-h)) - (turned(2 * h) - turned(-2 * h))) / (12.0 * h)
+
+
+def by_sensors(source, time, attitude, rate, *, acceleration=0.0, field=(0.0, 20.0, -43.0), iron=0.0, noise, seed=9):
+    """Return a recording by sensors with white noise of σ ``noise`` each: gyro, accelerometer, magnetometer with ``iron`` in body axes."""
+    white = np.random.default_rng(seed).standard_normal((3, len(time), 3))
+    gyro, force, compass = (sigma * draw for sigma, draw in zip(noise, white, strict=True))
+    return Recording(
+        source=source,
+        time=time,
+        rate=rate + gyro,
+        specific_force=attitude.inv().apply(acceleration + np.array([0.0, 0.0, 9.81])) + force,
+        magnetic_field=attitude.inv().apply(field) + iron + compass,
+        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
     )
 
 

@@ -3,11 +3,11 @@
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from measured import by_sensors, rates
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -47,36 +47,13 @@ def brisk(time: np.ndarray) -> Rotation:
     return path(time, ((0.9, 5.7), (0.6, 8.2), (0.8, 4.4)))
 
 
-def rates(time: np.ndarray, path: Callable[[np.ndarray], Rotation] = path) -> np.ndarray:
-    """Body rate by fourth-order differences of SciPy's rotations."""
-    h = 1e-3
-    here = path(time)
-
-    def turned(step: float) -> np.ndarray:
-        return (here.inv() * path(time + step)).as_rotvec()
-
-    return (8.0 * (turned(h) - turned(-h)) - (turned(2 * h) - turned(-2 * h))) / (12.0 * h)
-
-
-def measured(source, time, attitude, rate, *, acceleration=0.0, field=(0.0, 20.0, -43.0), iron=0.0, noise, seed=9):
-    """A recording by sensors with white noise of these σ: rate, specific force, field (East-North-Up) with an ``iron`` in body axes."""
-    white = np.random.default_rng(seed).standard_normal((3, len(time), 3))
-    gyro, force, compass = (sigma * draw for sigma, draw in zip(noise, white, strict=True))
-    return Recording(
-        source=source,
-        time=time,
-        rate=rate + gyro,
-        specific_force=attitude.inv().apply(acceleration + np.array([0.0, 0.0, 9.81])) + force,
-        magnetic_field=attitude.inv().apply(field) + iron + compass,
-        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
-    )
-
-
 @functools.cache
 def recording(duration: float = 30.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0), noise: float = 0.0) -> Recording:
     time = np.arange(round(duration * RATE)) / RATE
     field, sigma = [0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)], noise * np.array([0.01, 0.1, 0.5])
-    return measured("known truth", 100.0 + time, path(time), rates(time) + bias, field=field, noise=sigma, seed=1)
+    return by_sensors(
+        "known truth", 100.0 + time, path(time), rates(time, path) + bias, field=field, noise=sigma, seed=1
+    )
 
 
 def worst(result: ahrs.AhrsEstimate, after: float = 0.0) -> dict[str, float]:
@@ -259,7 +236,7 @@ def on_a_table(iron: tuple[float, ...] = (0.0, 0.0, 0.0), duration: float = 120.
     time = np.arange(round(duration * 50.0)) / 50.0
     attitude, field = START * Rotation.from_rotvec(np.zeros((len(time), 3))), (0.0, 22.0, -43.0)
     rate, noise = np.array([0.02, -0.02, 0.01]), (1e-3, 0.02, 0.3)
-    return measured("on a table", time, attitude, rate, field=field, iron=np.array(iron), noise=noise, seed=5)
+    return by_sensors("on a table", time, attitude, rate, field=field, iron=np.array(iron), noise=noise, seed=5)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
@@ -288,20 +265,10 @@ def test_sigma_of_the_heading_includes_iron_that_no_rotation_shows(smooth):
 def test_sigma_of_the_heading_includes_iron_that_small_slow_turns_hardly_show(smooth):
     """In the mean over iron of the prior σ that swings of 0.3 rad leave nearly all in the heading."""
     slow = functools.partial(path, turns=((0.3, 0.5), (0.3, 0.8), (0.4, 0.35)))
-    plain = recording(60.0, noise=0.3).taken(slice(None, None, 4))
-    time = plain.time - plain.time[0]
-    attitude, random = slow(time), np.random.default_rng(6)
-    noise = random.standard_normal((3, len(time), 3))
-    field = np.array([0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)])
-    swung = dataclasses.replace(
-        plain,
-        rate=rates(time, slow) + 3e-3 * noise[0],
-        specific_force=attitude.inv().apply([0.0, 0.0, 9.81]) + 0.03 * noise[1],
-        magnetic_field=attitude.inv().apply(field) + 0.3 * noise[2],
-        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
-    )
+    time, field = np.arange(3000) / 50.0, (0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP))
+    swung = by_sensors("slow", time, slow(time), rates(time, slow), field=field, noise=(3e-3, 0.03, 0.3), seed=6)
     squares = []
-    for iron in random.normal(0.0, 0.04 * 50.0, (12, 3)):
+    for iron in np.random.default_rng(7).normal(0.0, 0.04 * 50.0, (12, 3)):
         shifted = dataclasses.replace(swung, magnetic_field=swung.magnetic_field + iron)
         result = ahrs.estimate(shifted, latency=0.0, smooth=smooth, full_covariance=True)
         R = quaternion.to_matrix(result.estimate.attitude[-1])
@@ -319,7 +286,7 @@ def in_a_hurry(duration, lever_arm=0.0, seed=3):
     turning = np.cross(np.gradient(rate, 1.0 / RATE, axis=0), arm) + np.cross(rate, np.cross(rate, arm))
     field, bias = [0.0, 20.0 * np.cos(DIP), -20.0 * np.sin(DIP)], np.array([0.01, -0.02, 0.015])
     options = {"acceleration": attitude.apply(turning), "field": field, "noise": (2e-3, 0.03, 0.1), "seed": seed}
-    return measured("a hurry", 100.0 + time, attitude, rate + bias, **options)
+    return by_sensors("a hurry", 100.0 + time, attitude, rate + bias, **options)
 
 
 @functools.cache
@@ -514,7 +481,7 @@ def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0)
     """Three seconds, or ``length``, of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s."""
     time = np.arange(round(length * RATE)) / RATE
     attitude = START * Rotation.from_rotvec(np.outer(time, np.array(turn) * DEGREE))
-    quiet = measured("quiet", time, attitude, np.array(rate) * DEGREE, noise=(noise, 0.02, 0.2), seed=5)
+    quiet = by_sensors("quiet", time, attitude, np.array(rate) * DEGREE, noise=(noise, 0.02, 0.2), seed=5)
     return quiet if field else dataclasses.replace(quiet, magnetic_field=None)
 
 
@@ -617,7 +584,7 @@ def in_a_swell(seed: int, duration: float = 300.0) -> Recording:
     def attitude(time: np.ndarray) -> Rotation:
         return Rotation.from_euler("ZYX", waves(time)[:, :3], degrees=True)
 
-    return measured(
+    return by_sensors(
         "swell",
         time,
         attitude(time),
@@ -786,7 +753,7 @@ def driven(duration: float = 60.0) -> Recording:
     attitude = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
     rate = 0.3 * np.sin(0.25 * t)[:, None] * [0.0, 0.0, 1.0]
     noise = (2e-3, np.where(time > 2.0, 0.5, 0.02)[:, None], 0.3)
-    return measured("driven", time, attitude, rate, acceleration=np.gradient(velocity, time, axis=0), noise=noise)
+    return by_sensors("driven", time, attitude, rate, acceleration=np.gradient(velocity, time, axis=0), noise=noise)
 
 
 def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
@@ -860,7 +827,7 @@ def on_waves(duration: float = 60.0) -> Recording:
     attitude = START * Rotation.from_rotvec(roll[:, None] * [1.0, 0.0, 0.0])
     acceleration = -(w**2) * 2.0 * np.stack([np.sin(w * time), 0.3 * np.cos(w * time), np.cos(w * time)], axis=1)
     rate, noise = slope[:, None] * [1.0, 0.0, 0.0], (2e-3, 0.02, 0.3)
-    return measured("on waves", time, attitude, rate, acceleration=acceleration, noise=noise)
+    return by_sensors("on waves", time, attitude, rate, acceleration=acceleration, noise=noise)
 
 
 @pytest.mark.slow
@@ -939,13 +906,9 @@ def test_no_delay_is_found_where_nothing_shows_one():
     assert sensor_delays.magnetometer_delay(recording(1.5)) == (0.0, np.inf)
     assert ahrs.estimate(recording(noise=1.0)).delays.last_field == 0.0
     # turned at a constant rate, a field that is late is a field of another heading
-    random = np.random.default_rng(4)
-    steady = quiet_second((0.0, 0.0, 90.0), turn=(0.0, 0.0, 90.0))
-    times = np.arange(4000) / RATE
-    attitude = START * Rotation.from_rotvec(np.outer(times - 0.02, [0.0, 0.0, 90.0 * DEGREE]))
-    field = attitude.inv().apply([0.0, 20.0, -43.0]) + 0.3 * random.standard_normal((4000, 3))
-    rate = np.broadcast_to(steady.rate.mean(axis=0), (4000, 3)) + 1e-3 * random.standard_normal((4000, 3))
-    _, sigma = sensor_delays.magnetometer_delay(Recording(source="steady", time=times, rate=rate, magnetic_field=field))
+    times, turn = np.arange(4000) / RATE, np.array([0.0, 0.0, 90.0 * DEGREE])
+    attitude = START * Rotation.from_rotvec(np.outer(times - 0.02, turn))
+    _, sigma = sensor_delays.magnetometer_delay(by_sensors("steady", times, attitude, turn, noise=(1e-3, 0.02, 0.3)))
     assert sigma > 0.01
 
 

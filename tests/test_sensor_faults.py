@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from measured import by_sensors, rates
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -22,32 +23,17 @@ RATE = 200.0
 
 def swing(duration: float = 40.0) -> Recording:
     """A unit at rest for 2 s that then swings about its x axis at up to 8 rad/s, and slowly about the vertical; noise of a MEMS unit."""
+
+    def attitude(time: np.ndarray) -> Rotation:
+        since = np.maximum(time - 2.0, 0.0)
+        size = since**2 / (1.0 + since**2)
+        return Rotation.from_euler(
+            "ZX", size[:, None] * np.stack([0.3 * np.sin(0.5 * since), 1.3 * np.sin(6.0 * since)], -1)
+        )
+
     time = np.arange(round(duration * RATE)) / RATE
-    since = np.maximum(time - 2.0, 0.0)
-    size = since**2 / (1.0 + since**2)
-    roll, yaw = 1.3 * size * np.sin(6.0 * since), 0.3 * size * np.sin(0.5 * since)
-    attitude = Rotation.from_euler("ZX", np.stack([yaw, roll], -1))
-    h = 1e-3
-
-    def later(step: float) -> Rotation:
-        t = np.maximum(time + step - 2.0, 0.0)
-        s = t**2 / (1.0 + t**2)
-        return Rotation.from_euler("ZX", np.stack([0.3 * s * np.sin(0.5 * t), 1.3 * s * np.sin(6.0 * t)], -1))
-
-    rate = (later(-h).inv() * later(h)).as_rotvec() / (2.0 * h)
-    random = np.random.default_rng(3)
-
-    def measured(fixed: list[float], noise: float) -> np.ndarray:
-        return attitude.inv().apply(fixed) + noise * random.standard_normal((len(time), 3))
-
-    return Recording(
-        source="swing",
-        time=time,
-        rate=rate + 2e-3 * random.standard_normal(rate.shape),
-        specific_force=measured([0.0, 0.0, 9.81], 0.05),
-        magnetic_field=measured([0.0, 20.0, -45.0], 0.3),
-        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
-    )
+    field, noise = (0.0, 20.0, -45.0), (2e-3, 0.05, 0.3)
+    return by_sensors("swing", time, attitude(time), rates(time, attitude), field=field, noise=noise, seed=3)
 
 
 def with_rate(recording: Recording, limit: float) -> Recording:
