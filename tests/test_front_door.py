@@ -215,6 +215,12 @@ def test_an_integrated_attitude_has_no_bias_and_no_sigma():
     assert len(sd.plots.estimate_overview(history).axes) == 3
 
 
+def test_setups_and_scenarios_are_read_as_written(tmp_path):
+    setup = sd.FilterSetup.for_scenario(scenario(), states=False)
+    assert sd.estimation.setup.read_setup(sd.write(setup, tmp_path / "filter.toml")) == setup
+    assert sd.scenarios.load_scenario(sd.write(scenario(), tmp_path / "scenario.toml")) == scenario()
+
+
 @pytest.mark.parametrize(
     "call",
     [

@@ -558,6 +558,18 @@ def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
     np.testing.assert_allclose(values["gate"], 1.0, rtol=0.35)
 
 
+def test_against_a_truth_wrong_parameters_come_back():
+    cases = [case(seed) for seed in range(4)]
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 1.sigma": 3e-5})
+    fit = tuning.fit(tuning.error_objective(cases, off, ["gyro.arw", "star 1.sigma"]), starts=1, intervals=False)
+    for name, true in (("gyro.arw", ARW), ("star 1.sigma", 1e-4)):
+        assert abs(np.log(fit[name].value / true)) < max(4.0 * fit[name].standard_error, 0.2)
+        assert fit[name].standard_error < 0.4
+    compared = tuning.compare([case(seed) for seed in range(10, 14)], off, fit.setup)
+    assert abs(compared.after.anees - 1.0) < 0.35
+    assert compared.after.attitude_rms < compared.before.attitude_rms
+
+
 def test_a_reference_attitude_beside_the_record_serves_as_truth():
     simulated_case = case(1)
     truth = simulated_case.record.truth
