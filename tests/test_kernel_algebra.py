@@ -133,14 +133,6 @@ def test_plain_numbers_and_arrays_agree_to_the_bit(name):
     np.testing.assert_array_equal(function(x), [function(float(value)) for value in x])
 
 
-def test_polynomial_is_the_polynomial():
-    c = np.random.default_rng(2).standard_normal(6)
-    x = np.linspace(-2.0, 2.0, 31)
-    np.testing.assert_allclose(
-        series.polynomial(x, *c), np.polynomial.polynomial.polyval(x, c), rtol=0.0, atol=64 * EPS * np.abs(c).max()
-    )
-
-
 @pytest.mark.parametrize(("angle", "bound"), [(0.5, 2 * EPS), (1.0, 1e-12), (2.0, 1e-8)])
 def test_exponential_degrades_as_the_docstring_says(angle, bound):
     direction = np.array([0.48, -0.6, 0.64])
