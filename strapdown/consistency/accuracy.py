@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, are_finite, array
-from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
+from strapdown.consistency.alignment import (
+    ALIGNED,
+    Alignment,
+    Series,
+    align_series,
+    at_common_times,
+    in_common_frames,
+)
 from strapdown.consistency.manifold import nees
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
@@ -242,11 +249,11 @@ def accuracy_of(own: Series, theirs: Series) -> Accuracy:
 
 
 def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]]]:
-    """Return the alignment of two histories, and the errors after it."""
+    """Return the alignment of two histories, and the errors after it, about the vertical of the estimate."""
     thin = slice(None, None, max(1, len(own.time) // FITTED))
     _, alignment = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
     matched, truth = at_common_times(own, theirs, alignment.offset)
-    return alignment, _sizes(in_truth_frames(matched.attitude, alignment), truth, None)
+    return alignment, _sizes(*in_common_frames(matched.attitude, truth, *alignment.turns), None)
 
 
 def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:

@@ -49,13 +49,18 @@ class Alignment:
     body: Array
     """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
     covariance: Array
-    """Covariance (7, 7) of fixed, body, rad, and offset, s; 0 for those not estimated."""
+    """Covariance (7, 7) of the rotations, about the estimate's fixed and the truth's body axes, rad, and offset, s; 0 if not estimated."""
     estimated: tuple[str, ...]
     """Which of :data:`ALIGNED` were estimated and removed."""
     residual: float
     """RMS of the remaining angle, rad."""
     ambiguous: bool = False
     """Whether the motion does not distinguish the offset of the clock from a rotation of the frames; σ is that of what it determines."""
+
+    @property
+    def turns(self) -> tuple[Array, Array]:
+        """Quaternions of the rotations ``fixed`` and ``body``."""
+        return quaternion.exp(self.fixed), quaternion.exp(self.body)
 
     @property
     def sigma(self) -> Array:
@@ -93,6 +98,8 @@ class Alignment:
                     f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
                     f"axis{_usual(name, rotation)}: removed; a constant error of the filter would look the same"
                 )
+        if abs(quaternion.to_matrix(self.turns[0])[2, 2]) < math.cos(GROSS):
+            words.append("the truth's z axis is not that of the estimate: heading is about z of the estimate")
         return tuple(words)
 
 
@@ -139,11 +146,13 @@ def series_of(
     return Series(stamps, q, P, None if bias is None else array(f"{prefix}bias", bias, (m, 3)), moves)
 
 
-def in_truth_frames(attitude: Array, alignment: Alignment) -> Array:
-    """Return attitudes (m, 4) in the truth's frames."""
-    return quaternion.multiply(
-        quaternion.multiply(quaternion.exp(alignment.fixed), attitude), quaternion.exp(alignment.body)
-    )
+def in_common_frames(own: Array, truth: Truth, fixed: Array, body: Array) -> tuple[Array, Truth]:
+    """Return both attitudes (m, 4) in the estimate's fixed frame and the truth's body frame, given the quaternions between the frames.
+
+    The z axis of an estimate's fixed frame is vertical; that of a truth may not be.
+    """
+    true_attitude = quaternion.multiply(quaternion.conjugate(fixed), truth.attitude)
+    return quaternion.multiply(own, body), replace(truth, attitude=true_attitude)
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
@@ -268,7 +277,7 @@ def _descended(
     near = offset + np.array([-1.0, 1.0]) * min(LONGEST_OFFSET, 0.5 * common)  # half of the common time remains common
     for _ in range(20):
         matched, truth = at_common_times(own, theirs, offset)
-        aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
+        aligned, truth = in_common_frames(matched.attitude, truth, fixed, body)
         weight = _weights(matched)
         left = r = weight * quaternion.rotation_between(aligned, truth.attitude)
         if not free.any():
@@ -290,7 +299,7 @@ def _descended(
             step[:6] += both @ np.linalg.lstsq(both[3:], -quaternion.log(body) - step[3:6], rcond=None)[0]
         covariance = np.zeros((7, 7))
         covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
-        fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
+        fixed = quaternion.normalize(quaternion.multiply(fixed, quaternion.exp(step[:3])))
         body = quaternion.normalize(quaternion.multiply(body, quaternion.exp(step[3:6])))
         offset = float(np.clip(offset + step[6], *near))
         if np.all(np.abs(step) <= 1e-3 * np.sqrt(np.diag(covariance)) + 1e-12):
@@ -318,7 +327,10 @@ def _weights(own: Series) -> Array:
 
 
 def jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
-    """Return the derivatives (m, 3, 7) of the attitude error with respect to fixed rotation, body rotation and clock offset."""
+    """Return the derivatives (m, 3, 7) of the attitude error with respect to fixed rotation, body rotation and clock offset.
+
+    The attitudes are in common frames (:func:`in_common_frames`).
+    """
     middle, rate = rates(Series(time, truth.attitude))
     J = np.zeros((len(time), 3, 7))
     J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)

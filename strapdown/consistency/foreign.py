@@ -24,7 +24,7 @@ from strapdown.consistency.alignment import (
     Series,
     align_series,
     at_common_times,
-    in_truth_frames,
+    in_common_frames,
     jacobian,
     series_of,
 )
@@ -78,7 +78,8 @@ class Checked:
     judgement : Judgement
         The verdict with its evidence.
     estimate : Estimate
-        The estimate as it was judged: in the truth's clock and frames, with the covariance of the body-side error, and with its truth.
+        The estimate as it was judged: in the truth's clock and body frame and its own fixed frame, whose z axis is vertical, with the
+        covariance of the body-side error, and with its truth.
     alignment : Alignment or None
         Differences of clocks and frames that were estimated and removed.
     error_frame : str
@@ -196,7 +197,8 @@ def check_attitudes(
             "check the unit of time"
         )
     remarks += alignment.words
-    aligned, reading = in_truth_frames(common.attitude, alignment), _Reading("", {})
+    aligned, true = in_common_frames(common.attitude, true, *alignment.turns)
+    reading = _Reading("", {})
     if whole.covariance is not None:
         reading = _read(common, aligned, true, alignment, declared, confidence_level)
         whole = replace(whole, covariance=read_as(reading.frame, whole.covariance, whole.attitude))
@@ -304,7 +306,7 @@ def _read(
 ) -> _Reading:
     """Return the covariance by the ``declared`` definition, or by that which the errors show, and what would explain the errors.
 
-    ``aligned`` (m, 4): attitudes in the truth's frames.
+    ``aligned`` (m, 4): attitudes in the common frames (:func:`in_common_frames`).
     """
     derivatives = jacobian(common.time, aligned, true)
     readings = _readings(common, alignment, derivatives)
@@ -315,7 +317,7 @@ def _read(
     others = list(_other_frames(error, readings, frame, probabilities))
     bias = None
     if common.bias is not None:
-        bias = quaternion.rotate(quaternion.conjugate(quaternion.exp(alignment.body)), common.bias)
+        bias = quaternion.rotate(quaternion.conjugate(alignment.turns[1]), common.bias)
         if not common.bias.any():
             others.append(_zero_bias(true.bias, covariance))
     explained = explanations(error, covariance, derivatives, others, confidence_level=confidence_level)
@@ -362,7 +364,7 @@ def _readings(own: Series, alignment: Alignment, J: Array) -> dict[str, Array]:
     ``J`` (m, 3, 7): derivatives of the errors with respect to the alignment (:func:`jacobian`).
     """
     assert own.covariance is not None
-    turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
+    turn = quaternion.to_matrix(alignment.turns[1]).T
     T = np.kron(np.eye(own.covariance.shape[1] // 3), turn)
     readings = {name: T @ read_as(name, own.covariance, own.attitude) @ T.T for name in ERROR_FRAMES}
     for P in readings.values():
