@@ -489,6 +489,18 @@ def test_heading_is_about_the_vertical_of_the_estimate_also_if_the_truth_has_y_u
     assert not any("heading is about z" in remark for remark in checked(replayed).remarks)
 
 
+@pytest.mark.parametrize(("align", "heading"), [("time,fixed", 0.0), ("time", 2.0), ("none", None)])
+def test_the_errors_are_those_of_the_alignment_that_was_asked_for(align, heading, replayed):
+    """Two degrees of heading are removed with the fixed frame only; by default all differences are."""
+    attitude = quaternion.multiply(HEADING, replayed.record.truth.attitude)
+    sizes = checked(replayed, attitude=attitude, align=align).accuracy.aligned
+    if heading is None:
+        assert sizes == {}
+    else:
+        assert sizes["all samples"]["heading"].rms == pytest.approx(heading * DEGREE, abs=0.5 * DEGREE)
+    assert checked(replayed, attitude=attitude).accuracy.aligned["all samples"]["heading"].rms < 1e-6
+
+
 def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():
     time = 1e3 * np.arange(200.0)
     truth = FLIGHT.motion.attitude(np.linspace(0.0, 100.0, 200))

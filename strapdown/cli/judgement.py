@@ -26,7 +26,8 @@ class _Foreign:
     error_frame: str = Option("find", help="Frame of the covariance: body, fixed or euler; find: by the errors.")
     align: str = Option(
         "auto",
-        help="Differences to estimate and remove: any of time,fixed,body (frames), or none; auto: clock offset, and rotations beyond 5°.",
+        help="Differences to estimate and remove: any of time,fixed,body (frames), or none; auto: clock offset, and rotations beyond 5°, "
+        "the table of errors also with all removed.",
     )
     aligned: Path | None = Option(None, help="HDF5 file for the aligned estimate, which `strapdown report` reads.")
 

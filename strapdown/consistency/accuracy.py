@@ -226,7 +226,9 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else own.covariance[known])
     alignment, aligned, bias = None, dict[str, dict[str, ErrorSize]](), None
     if align:
-        alignment, aligned = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
+        truth_at = Series(own.time[known], theirs.attitude, movement=theirs.movement)
+        alignment = _whole_alignment(own, truth_at)
+        aligned = _aligned_sizes(own, truth_at, alignment)
     if truth.has_bias and estimate.has_bias:
         rows = are_finite(truth.bias)
         squares = (estimate.bias - truth.bias)[rows] ** 2, estimate.variance[rows, 3:]
@@ -234,12 +236,13 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     return Accuracy(given=as_stored, aligned=aligned, alignment=alignment, bias=bias)  # type: ignore[arg-type]
 
 
-def accuracy_of(own: Series, theirs: Series) -> Accuracy:
+def accuracy_of(own: Series, theirs: Series, alignment: Alignment | None = None) -> Accuracy:
     """Return the errors of a history of attitudes against another in its own clock and frames, as given and aligned.
 
-    The errors as given are left out if the two have no times in common.
+    By default all differences of clocks and frames are removed. The errors as given are left out if the two have no times in common.
     """
-    alignment, aligned = _aligned_sizes(own, theirs)
+    alignment = _whole_alignment(own, theirs) if alignment is None else alignment
+    aligned = _aligned_sizes(own, theirs, alignment) if alignment.estimated else {}
     as_stored: dict[str, dict[str, ErrorSize]] = {}
     with contextlib.suppress(InputError):
         matched, truth = at_common_times(own, theirs, 0.0)
@@ -248,12 +251,16 @@ def accuracy_of(own: Series, theirs: Series) -> Accuracy:
     return Accuracy(given=as_stored, aligned=aligned, alignment=alignment)
 
 
-def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]]]:
-    """Return the alignment of two histories, and the errors after it, about the vertical of the estimate."""
+def _whole_alignment(own: Series, theirs: Series) -> Alignment:
+    """Return all differences of clocks and frames of two histories."""
     thin = slice(None, None, max(1, len(own.time) // FITTED))
-    _, alignment = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
+    return align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])[1]
+
+
+def _aligned_sizes(own: Series, theirs: Series, alignment: Alignment) -> dict[str, dict[str, ErrorSize]]:
+    """Return the errors after an alignment, about the vertical of the estimate."""
     matched, truth = at_common_times(own, theirs, alignment.offset)
-    return alignment, _sizes(*in_common_frames(matched.attitude, truth, *alignment.turns), None)
+    return _sizes(*in_common_frames(matched.attitude, truth, *alignment.turns), None)
 
 
 def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:

@@ -156,7 +156,8 @@ def check_attitudes(
         Definition of the covariance (:data:`ERROR_FRAMES`). "find" takes the one that the file declares, else that of maximum likelihood
         given the errors.
     align : "auto", "none", or any of "time", "fixed", "body"
-        Differences to estimate and remove. "auto": a clock offset beyond three times its σ, and rotations above 5°.
+        Differences to estimate and remove. "auto": a clock offset beyond three times its σ, and rotations above 5°; the errors are then
+        also reported with all differences removed.
     confidence_level, detectable_error : float
         As for :func:`strapdown.consistency.judge`.
 
@@ -188,7 +189,8 @@ def check_attitudes(
     one_of("error_frame", declared, ("find", *ERROR_FRAMES))
     whole, theirs = _series_of_both(own, truth)
     remarks: list[str] = []
-    whole, alignment = align_series(whole, theirs, _wanted(align), remarks)
+    wanted = _wanted(align)
+    whole, alignment = align_series(whole, theirs, wanted, remarks)
     common, true = at_common_times(whole, theirs, alignment.offset)
     if len(common.time) < FEW_IN_COMMON * min(len(whole.time), len(theirs.time)):
         lasts, last = np.ptp(whole.time), np.ptp(theirs.time)
@@ -225,7 +227,7 @@ def check_attitudes(
         frame_probability=reading.probabilities if declared == "find" else {},
         explanations=tuple(replace(e, known=_is_known(e, estimate)) for e in reading.explanations),
         remarks=tuple(remarks),
-        accuracy=accuracy_of(whole, theirs),
+        accuracy=accuracy_of(whole, theirs, None if wanted is None else alignment),
     )
 
 
