@@ -251,14 +251,24 @@ def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark)
         np.testing.assert_array_equal(recording.specific_force, plain.specific_force)
 
 
-def test_columns_separated_by_spaces_and_lines_above_the_header_are_reported(csv):
+def test_columns_separated_by_spaces_are_reported(csv):
     spaced = csv(HEADER.replace(",", " "), [row.replace(",", " ") for row in ROWS])
-    refused(spaced, "is one column", "separate columns by comma")
-    refused(
-        csv(f"Device: A\nMade by: B\n\n{HEADER}"),
-        "'Device: A Made by: B', is one column",
-        "delete lines above the header",
-    )
+    refused(spaced, "its header, 'time gx [rad/s] gy", "is one column", "separate columns by comma")
+
+
+ABOVE = {
+    "words": "Device: A\nMade by: B\n\n",
+    "comments of a tracker": "// Start Time: Unknown\n// Update Rate: 100.0Hz\n// Filter Profile: human, slow (46.1)\n",
+    "pairs": "sep=,\nDeviceTag:,Dot 3\nFirmwareVersion:,2.0.0\nOutputRate:,60\n\n",
+}
+
+
+@pytest.mark.parametrize("above", ABOVE.values(), ids=ABOVE)
+def test_lines_above_the_header_are_skipped(csv, above):
+    rate = read(csv()).rate
+    np.testing.assert_array_equal(read(csv(f"{above}{HEADER},", [f"{row}," for row in ROWS])).rate, rate)
+    np.testing.assert_array_equal(read(csv(f"{above}time,gx,gy,gz,ax,ay,az\n,rad/s,,,m/s2,,", ROWS)).rate, rate)
+    refused(csv(f"{above}{HEADER}", [ROWS[0] + ",1"]), "data row 1 has 8 fields, the header 7")
 
 
 @pytest.mark.parametrize(("columns", "name"), [("ax [m/s2],ay,az", "specific_force"), ("mx,my,mz", "magnetic_field")])

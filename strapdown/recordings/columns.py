@@ -175,8 +175,7 @@ def _need_whole_groups(source: str, header: Sequence[Column], roles: Mapping[str
     """Raise an error if columns of time or gyro, or some of another group, are missing."""
     if len(header) == 1:
         raise InputError(
-            f"{source}: its header, {header[0].said[:60]!r}, is one column; delete lines above the header, and separate columns by "
-            "comma, semicolon, tab or |"
+            f"{source}: its header, {header[0].said[:60]!r}, is one column; separate columns by comma, semicolon, tab or |"
         )
     for group, members in GROUPS.items():
         missing = [role for role in members if role not in roles]

@@ -1,7 +1,8 @@
 """Recordings as delimited text (CSV, TSV and similar), with a header of any names.
 
-The separator is the one of ``, ; tab |`` that splits the header into most columns. Lines that begin with ``#`` are comments; if there is no
-other header before the numbers, the last comment is the header (EuRoC). Two header rows are joined: an empty cell of the first takes the
+The separator is the one of ``, ; tab |`` that splits the header into most columns. Lines above the header are skipped if they have fewer
+fields than time and gyro need. Lines that begin with ``#`` are comments; if there is no other header before the numbers, the last comment
+is the header (EuRoC). Two header rows are joined: an empty cell of the first takes the
 value of the cell before it (RepoIMU), and a second row of units is put in brackets. If the separator is not a comma, decimal commas are
 accepted. Roles of the columns: :mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns. Integer stamps
 are read as integers, so that nanoseconds since 1970 keep all their digits. A time may be an ISO 8601 date, to the microsecond, UTC unless
@@ -31,6 +32,9 @@ from strapdown.recordings import columns as naming
 from strapdown.records.recording import Recording
 
 SEPARATORS = ",;\t|"
+_SEPARATOR = f"[{SEPARATORS}]"
+FEWEST_COLUMNS = 4
+"""Time and the three axes of a gyro: lines above the header with fewer fields are skipped."""
 
 
 def read_csv(
@@ -101,6 +105,7 @@ class Table:
 def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]:
     """Return the names of the columns of a table, its separator, and its first lines of numbers."""
     titles: list[str] = []
+    above: list[str] = []
     comment = ""
     first: list[str] = []
     for line in lines:
@@ -109,6 +114,9 @@ def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]
         if line.lstrip().startswith("#"):
             comment = line.lstrip().lstrip("#").strip() or comment
             continue
+        if not titles and len(re.split(_SEPARATOR, line)) < FEWEST_COLUMNS:
+            above.append(line.strip())
+            continue
         if _numeric(line):
             titles, first = titles or [comment], [line]  # without a header line, the last comment may be the header
             break
@@ -116,6 +124,7 @@ def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]
         if len(titles) == 3:
             first = [titles.pop()]
             break
+    titles = titles or above[:1]
     if not any(title.strip() for title in titles):
         words = "has no header" if first else "is empty"
         raise InputError(f"{source} {words}; wanted a header like time,gx,gy,gz,ax,ay,az")
@@ -159,7 +168,7 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
 
 def _numeric(line: str) -> bool:
     """Return whether at least half of the non-empty fields of a line are numbers, with any separator."""
-    filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
+    filled = [cell for part in re.split(_SEPARATOR, line) if (cell := part.strip().strip('"'))]
     return bool(filled) and 2 * sum(map(is_number, filled)) >= len(filled)
 
 
