@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -244,11 +245,26 @@ def test_what_an_ending_has_no_room_for_is_refused(case, tmp_path):
     estimate, _ = case
     with pytest.raises(InputError, match=r"ends in '.xls', but an estimate is written as .bag, "):
         recordings.write(estimate, tmp_path / "x.xls")
-    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no option sequence"):
+    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no option `sequence=` \(known: `frame=`\)"):
         recordings.write(estimate, tmp_path / "x.tum", sequence="ZYX")
     with pytest.raises(InputError, match="needs the samples too; give the recording"):
         recordings.write(estimate, tmp_path / "x.bag")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("module", "ending"), [("pyarrow.parquet", "parquet"), ("rosbags.typesys", "mcap")])
+def test_a_file_whose_library_is_missing_is_refused_before_the_computation(
+    refusal, tmp_path, monkeypatch, module, ending
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    path, out = tmp_path / "rest.csv", tmp_path / "out"
+    rows = "".join(f"{k / 100},0,0,0,0,0,9.8\n" for k in range(300))
+    path.write_text(f"time,gx [rad/s],gy,gz,ax [m/s2],ay,az\n{rows}")
+    error = refusal("estimate", path, "--out", out, "--to", tmp_path / f"e.{ending}")
+    assert f"writing e.{ending} needs {module.partition('.')[0]}" in error
+    assert not out.exists()
+    error = refusal("estimate", path, "--out", out, "--to", tmp_path / "e.tum", "--euler", "ZYX")
+    assert "has no option --euler (known: --frame)" in error
 
 
 def test_the_command_writes_further_files(tmp_path):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
 """Control characters except tab and newline."""
 _OPTIONS = {"initial": "--attitude or --from-truth", "noise": "--gyro", "priors": "--prior"}
-_OPTIONS |= {"estimator": "--filter", "setup": "--filter"}
+_OPTIONS |= {"estimator": "--filter", "setup": "--filter", "sequence": "--euler"}
 """Options whose names differ from those of the argument in Python."""
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Hint, InputError, one_of
-from strapdown.files import BAGS, HDF5, TABLES, reading
+from strapdown.files import BAGS, HDF5, TABLES, library, reading
 from strapdown.recordings import broad, dataframes, delimited, ros, telemetry, trajectories, ulog
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord, outputs
@@ -44,6 +44,8 @@ class Format:
     """Function that writes a recording, from it and a path; None: cannot be written."""
     write_estimate: Any = None
     """Function that writes an estimate, likewise, with ``estimate_options``, and with the keyword ``recording`` if ``with_samples``."""
+    written_by: str = ""
+    """Optional module without which it cannot be written."""
     options: tuple[str, ...] = ()
     """Keywords of :func:`read` that the reader accepts."""
     estimate_options: tuple[str, ...] = ()
@@ -77,6 +79,7 @@ FORMATS: tuple[Format, ...] = (
         read=ros.read_bag,
         options=("topic",),
         write=ros.write_bag,
+        written_by="rosbags.typesys",
         lacks=("movement",),
         write_estimate=ros.write_estimate,
         estimate_options=("source",),
@@ -96,6 +99,7 @@ FORMATS: tuple[Format, ...] = (
         read=dataframes.read_parquet,
         options=("units", "columns"),
         write=dataframes.write_recording,
+        written_by="pyarrow.parquet",
         write_estimate=dataframes.write_estimate,
         estimate_options=("sequence", "frame"),
     ),
@@ -235,11 +239,16 @@ def estimate_format(
     file_format = _by_ending(path, "write_estimate")
     for name, value in (options or {}).items():
         if name not in file_format.estimate_options:
-            raise InputError(f"{path} ({file_format.name}) has no option {name}; leave it out, or change the extension")
+            known = ", ".join(str(Hint(option)) for option in file_format.estimate_options) or "none"
+            raise InputError(
+                f"{path} ({file_format.name}) has no option {Hint(name)} (known: {known}); leave it out, or change the extension"
+            )
         if name == "frame":
             one_of("frame", value, outputs.FRAMES)
         elif name == "sequence":
             outputs.euler([[1.0, 0.0, 0.0, 0.0]], value)
+    if file_format.written_by:
+        library(file_format.written_by, f"writing {Path(path).name}")
     if file_format.with_samples and not recording:
         raise InputError(
             f"{path} ({file_format.name}) needs the samples too; give the recording that the estimate was made from"
