@@ -312,6 +312,24 @@ def test_a_row_for_each_sensor_is_one_recording(csv):
     np.testing.assert_array_equal(recording.specific_force, [[k, 2, 9] for k in range(4)])
 
 
+@pytest.mark.parametrize("every", [1, 2, 500], ids=["always", "often", "seldom"])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["gyro first", "gyro last"])
+def test_rows_of_each_sensor_with_one_stamp_are_one_sample(csv, every, order):
+    """Sensors with one clock, as concatenated by pandas: no sample is lost."""
+    rows = [(f"{0.01 * k:.2f},{k},0,0,,,", f"{0.01 * k:.2f},,,,{k},2,9") for k in range(1000)]
+    lines = [row[j] for k, row in enumerate(rows) for j in order if j == 0 or k % every == 0]
+    recording = read(csv(rows=lines))
+    np.testing.assert_array_equal(recording.rate[:, 0], range(1000))
+    np.testing.assert_array_equal(recording.specific_force[::every, 0], range(0, 1000, every))
+    assert np.isnan(recording.specific_force).any(axis=1).sum() == 1000 - len(range(0, 1000, every))
+    assert (recording.left_out_words, recording.remarks) == ("", ())
+
+
+def test_two_samples_of_one_sensor_with_one_stamp_are_refused(csv):
+    rows = [f"{0.01 * k:.2f},{k},0,0,,,\n{0.01 * k:.2f},,,,{k},2,9" for k in range(4)]
+    refused(csv(rows=[*rows, "0.03,,,,4,2,9"]), "other samples: 1 of 9, the first 0.03 s in row 9")
+
+
 def test_samples_for_which_there_is_no_row_of_the_gyro_are_counted(csv):
     rows = [
         f"{0.01 * k:.2f},{k},0,0,,,\n{0.01 * k + 0.004:.3f},,,,{k},2,9\n{0.01 * k + 0.0049:.4f},,,,7,2,9"

@@ -41,7 +41,7 @@ _ROWS = ("time", *FIELDS.values())
 
 
 FEW_REPEATED = 0.01
-"""Share of rows with the stamp of the row before, below which they are left out even if their samples differ."""
+"""Share of rows with the stamp of the row before and other samples, below which they are left out."""
 LONGEST_GAP = 30.0 * 86400.0
 """Maximum interval between samples, s. Longer ones are a clock that was set, and a filter would divide them into millions of steps."""
 LARGEST_RATE = 2000.0
@@ -82,8 +82,8 @@ class Recording(Listed):
         Stamps of rows without a gyro sample, s. These rows are left out (:func:`with_gyro`): the intervals on both sides are joined, the
         rotation is computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
     repeated : ndarray (k,), default empty
-        Stamps of rows that repeat the stamp of the row before, s; they are left out. If their share is above :data:`FEW_REPEATED` and
-        their samples differ, the file is rejected.
+        Stamps of rows that repeat the stamp of the row before and add no sensor's sample, s; they are left out. If the share of those with
+        other samples is above :data:`FEW_REPEATED`, the file is rejected.
     remarks : tuple of str, default empty
         Choices and omissions of the reader, one sentence each: columns guessed, topics used.
     """
@@ -211,25 +211,13 @@ class Recording(Listed):
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
     """Return a recording of the rows that have a gyro sample and do not repeat the row before, with the stamps of the other rows.
 
-    A log may have a row for each sensor: vectors and temperatures in rows without the gyro go to the nearest row with it that lacks them.
+    A log may have a row for each sensor: rows of one stamp are one, and vectors and temperatures in rows without the gyro go to the nearest
+    row with it that lacks them.
     """
     not_back(f"{source}: time", time)  # before rows are left out
-    same = np.diff(time) == 0.0
     columns |= {"time": time, "rate": rate}
-    if same.any() and np.mean(same) >= FEW_REPEATED:
-        held = [
-            np.reshape(c, (len(time), -1)) for n, c in columns.items() if n in _ROWS and np.shape(c)[:1] == time.shape
-        ]
-        rows = np.hstack(held).astype(np.float64)
-        other = same & np.any((rows[1:] != rows[:-1]) & ~(np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
-        if other.any():
-            row = int(np.argmax(other)) + 1
-            raise InputError(
-                f"{source}: rows with the stamp of the row before and other samples: {other.sum()} of {len(time)}, the first "
-                f"{time[row]:.9g} s in row {row + 1}; drop them, or write the stamps with more digits"
-            )
-    if same.any():
-        columns = _rows(columns, np.concatenate([[True], ~same])) | {"repeated": time[1:][same]}
+    if (np.diff(time) == 0.0).any():
+        columns = _one_row_a_stamp(source, columns)
     known = np.asarray(~np.isnan(columns["rate"]).any(axis=1))
     if not known.all():
         if np.sum(known) < 2:
@@ -248,6 +236,33 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                     )
         columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known], "remarks": remarks}
     return Recording(source=source, **columns)
+
+
+def _one_row_a_stamp(source: str, columns: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns with one row for each stamp, which has the first sample of each sensor; rows that add none are ``repeated``."""
+    time = columns["time"]
+    first = np.append(True, np.diff(time) != 0.0)
+    row_of_stamp, stamp = np.flatnonzero(first), np.cumsum(first) - 1
+    used, other = first.copy(), np.zeros(len(time), bool)
+    merged = {"time": time[first]}
+    for name in FIELDS.values():
+        values = columns.get(name)
+        if values is None or np.shape(values)[:1] != time.shape:
+            continue
+        samples = np.reshape(values, (len(time), -1)).astype(np.float64)
+        known = np.flatnonzero(~np.isnan(samples).any(axis=1))
+        row = row_of_stamp.copy()
+        row[stamp[known[::-1]]] = known[::-1]  # the first comes last and stays
+        used[row] = True
+        other[known] |= (samples[known] != samples[row[stamp[known]]]).any(axis=1)
+        merged[name] = values[row]
+    if np.mean(other) >= FEW_REPEATED:
+        k = int(np.argmax(other))
+        raise InputError(
+            f"{source}: rows with the stamp of the row before and other samples: {other.sum()} of {len(time)}, the first "
+            f"{time[k]:.9g} s in row {k + 1}; drop them, or write the stamps with more digits"
+        )
+    return columns | merged | {"repeated": time[~used]}
 
 
 def _rows(columns: dict[str, Any], kept: NDArray[np.bool_]) -> dict[str, Any]:
