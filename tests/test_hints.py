@@ -50,6 +50,7 @@ def test_every_hint_has_an_option():
         (Hint("error_frame", "body"), "`error_frame='body'`", "--error-frame body"),
         (Hint("axes", {"gyro": "y,x,-z"}), "`axes={'gyro': 'y,x,-z'}`", "--axes gyro=y,x,-z"),
         (Hint("units", {"time": "ms"}), "`units={'time': 'ms'}`", "--time-unit ms"),
+        (Hint("columns", {"gx": "X [dps]"}), "`columns={'gx': 'X [dps]'}`", "--columns 'gx=X [dps]'"),  # for a shell
         (Hint("initial"), "`initial=`", "--attitude or --from-truth"),
     ],
 )

@@ -184,6 +184,14 @@ def test_bad_options_are_refused(csv, header, options, words):
     refused(csv(header), *words, **options)
 
 
+def test_a_wrong_unit_in_the_header_is_replaced_as_the_refusal_says(csv):
+    """`doctor` finds that the header's unit is wrong; the option alone contradicts the header."""
+    path = csv()
+    columns = {"gx": "gx [deg/s]", "gy": "gy [deg/s]", "gz": "gz [deg/s]"}
+    refused(path, f"replace the header's by `columns={columns}`", units={"gyro": "deg/s"})
+    np.testing.assert_allclose(read(path, columns=columns).rate, np.radians(read(path).rate), rtol=1e-15)
+
+
 def test_options_of_samples_that_do_not_apply_are_refused(csv, tmp_path):
     path = csv()
     gyro = recordings.read_samples(path, "gyro")

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import inspect
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -47,7 +48,7 @@ def option(hint: Hint) -> str:
     if hint.argument == "units":
         return " ".join(f"--{name}-unit {unit}" for name, unit in hint.value.items())
     parts = hint.value.items() if isinstance(hint.value, dict) else ()
-    return f"{flag} {','.join(f'{name}={value}' for name, value in parts) or hint.value}"
+    return f"{flag} {shlex.quote(','.join(f'{name}={value}' for name, value in parts) or str(hint.value))}"
 
 
 class PlainConsole(Console):

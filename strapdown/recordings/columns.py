@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -152,7 +152,7 @@ def recording(
         raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     roles, declared, remark = _roles(source, header, columns)
     _need_whole_groups(source, header, roles)
-    unit_of_group = _units(source, {_group(role) for role in roles}, declared, units)
+    unit_of_group = _units(source, {role: header[k].name for role, k in roles.items()}, declared, units)
     values = table.load(sorted(set(roles.values())), roles["time"]).__getitem__
     stamps = table.clock_ns(declared.get("time", ""))
     if stamps is None:
@@ -357,12 +357,13 @@ def _end(name: str) -> str:
 
 
 def _units(
-    source: str, present: Collection[str], declared: Mapping[str, str], options: Mapping[str, str]
+    source: str, names: Mapping[str, str], declared: Mapping[str, str], options: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the unit of each group of columns in the table; empty for a magnetometer without a declared unit."""
+    """Return the unit of each group of the table's columns, named by role; empty for a magnetometer without a declared unit."""
     result: dict[str, str] = {}
     for group, units in UNITS.items():
-        if group not in present:
+        present = [role for role in GROUPS[group] if role in names]
+        if not present:
             continue
         option = options.get(group, "")
         option = unit_of(group, option) or option
@@ -374,8 +375,10 @@ def _units(
                 f"{Hint('units', {group: next(iter(units))})} ({', '.join(units)})"
             )
         if option and declared.get(group) and option != declared[group]:
+            replaced = {role: f"{names[role]} [{option}]" for role in present}
             raise InputError(
-                f"{source}: the header declares {declared[group]} for the {group}, the option is {option}; drop one"
+                f"{source}: the header declares {declared[group]} for the {group}, the option is {option}; drop one, or replace the "
+                f"header's by {Hint('columns', replaced)}"
             )
         result[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
     return result
