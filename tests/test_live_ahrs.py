@@ -205,6 +205,15 @@ def test_a_rate_is_no_interval():
         LiveAhrs(interval=100)
 
 
+def test_parameters_for_a_magnetometer_are_refused_without_one():
+    parameters = ahrs.MOTIONS["vehicle"][0]
+    words = r"hard_iron_sigma is 0.04, but there is no magnetometer; .*, such as ahrs.MOTIONS\['hand'\]\[1\]"
+    with pytest.raises(InputError, match=words):
+        LiveAhrs(interval=0.01, parameters=parameters)
+    with pytest.raises(InputError, match=words):
+        ahrs.estimate(swinging(), parameters)
+
+
 def test_samples_far_faster_than_declared_are_refused():
     live = LiveAhrs(interval=0.01)
     for k in range(14):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import estimation
 from strapdown.ahrs import headings, regions, starting
-from strapdown.ahrs.parameters import AhrsParameters, of_motion
+from strapdown.ahrs.parameters import AhrsParameters, error_states, of_motion
 from strapdown.ahrs.preparing import GRAVITY
 from strapdown.checks import Array, InputError, instance, non_negative, positive
 from strapdown.estimation import live as estimation_live
@@ -97,7 +97,6 @@ class LiveAhrs:
         self.magnetometer = magnetometer
         self.parameters = parameters or of_motion("hand", magnetometer=magnetometer)
         late = 0.5 * self.interval if latency is None else non_negative("latency", latency, unit="s")
-        setup = self.parameters.setup
         kinds: list[tuple[str, Any, Array]] = [
             ("accelerometer", "vector", GRAVITY),
             ("magnetometer", "heading", headings.NORTH),
@@ -114,11 +113,9 @@ class LiveAhrs:
             for sensor, kind, reference in kinds
         ]
         self._filter = estimation.LiveFilter(
-            setup.process_noise,
+            self.parameters.setup.process_noise,
             estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=1.0),
-            ()
-            if setup.states is None
-            else setup.states.blocks({series.sensor: series.kind for series in self._sensors}),
+            error_states(self.parameters, *((sensor, kind) for sensor, kind, _ in kinds)),
             sensors=self._sensors,
         )
         self._sample = np.zeros(10)

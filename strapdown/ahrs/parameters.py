@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import non_negative, one_of, positive
+from strapdown.checks import InputError, non_negative, one_of, positive
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
@@ -179,8 +179,12 @@ class AhrsParameters:
 @functools.lru_cache(maxsize=16)
 def error_states(parameters: AhrsParameters, *sensors: tuple[str, str]) -> tuple[ErrorStates, ...]:
     """Return the error states of the filter with these sensors, each with its kind."""
-    states = parameters.setup.states
-    return () if states is None else states.blocks(dict(sensors))
+    kinds, iron, states = dict(sensors), parameters.hard_iron_sigma, parameters.setup.states
+    if iron > 0.0 and "magnetometer" not in kinds:
+        raise InputError(
+            f"hard_iron_sigma is {iron:g}, but there is no magnetometer; give parameters without one, such as ahrs.MOTIONS['hand'][1]"
+        )
+    return () if states is None else states.blocks(kinds)
 
 
 HAND_HELD = AhrsParameters(
