@@ -204,6 +204,17 @@ def test_a_time_may_be_a_date(tmp_path):
         read(path)
 
 
+@pytest.mark.parametrize("stamp", ["10:15:30.000", "28.11.2026 10:15:30", "2026-11-28 25:00:00"])
+def test_another_time_of_day_or_date_is_refused_with_one_that_is_read(tmp_path, stamp):
+    path = tmp_path / "walk.csv"
+    path.write_text(f"time,gx [dps],gy,gz\n{stamp},1,2,3\n{stamp},1,2,3\n")
+    with pytest.raises(
+        InputError, match=rf"column time is '{stamp}', not a number; write seconds, or dates such as (\S+)$"
+    ) as error:
+        read(path)
+    assert delimited.date_ns(str(error.value).split()[-1]) is not None
+
+
 def test_milliseconds_since_1970_keep_every_nanosecond(table):
     """Doubles of this size are 64 ns apart in seconds, 256 in nanoseconds; the product is taken in integers."""
     stamps = 1_763_850_000_009 + np.array([0, 10, 21])

@@ -388,6 +388,7 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
     [
         ("empty.csv", b"", ("is empty", "time,gx")),
         ("binary.csv", bytes(range(256)) * 8, ()),
+        ("excel.csv", "time,gx".encode("utf-16"), ("write it in UTF-8, not UTF-16",)),
         ("walk.mat", b"\0" * 100, ("extension '.mat'", ".csv")),
         ("flight.toml", b"rate_hz = 100.0\n", ("extension '.toml'", ".csv")),
         ("walk.h5", b"time,gx", ("cannot be read as HDF5", "of another kind")),

@@ -155,7 +155,12 @@ def text(path: Name, *, link: bool = True) -> str:
     """Return the text of a file in UTF-8."""
     raw = content(path, link=link)
     if b"\0" in raw:
-        raise InputError(f"{path} cannot be read as text (it has zero bytes); the file is damaged or of another kind")
+        words = (
+            "write it in UTF-8, not UTF-16"
+            if raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+            else "the file is damaged or of another kind"
+        )
+        raise InputError(f"{path} cannot be read as text (it has zero bytes); {words}")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:

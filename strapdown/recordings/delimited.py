@@ -89,7 +89,8 @@ class Table:
             return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
         except ValueError:
             where = f"data row {row + 1}, column {self.header[place]}"
-            raise InputError(f"{self.source}: {where} is {cell!r}, not a number") from None
+            remedy = "; write seconds, or dates such as 2026-11-28T10:15:30.25" if time else ""
+            raise InputError(f"{self.source}: {where} is {cell!r}, not a number{remedy}") from None
 
     def clock_ns(self, unit: str) -> NDArray[np.int64] | None:
         """Return the loaded stamps, of a unit, "" if unknown, if they are dates, or integers that count ns from 1970; else None."""
