@@ -26,6 +26,7 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
 from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records.recording import with_gyro
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -1261,6 +1262,19 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     np.testing.assert_allclose(variance[:, 0], 2.0 * (own + (1.0 - own) * level[:-1]), rtol=1e-12)
     as_modelled = with_innovations(np.ones((steps, 2)), 2.0, vertical=np.sqrt(2.0))
     np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain, INTERVAL), 1.0, rtol=1e-12)
+
+
+def test_a_lost_packet_does_not_hide_the_level_of_the_acceleration():
+    """One sample of the gyro in each second is lost, as on a serial line: NIS stays as of the whole recording."""
+    whole = dataclasses.replace(recording(60.0, noise=1.0), magnetic_field=None)
+    lost = with_gyro(
+        source="lossy",
+        time=whole.time,
+        rate=np.where(np.arange(len(whole.time))[:, None] % 100 == 50, np.nan, whole.rate),
+        specific_force=whole.specific_force,
+    )
+    nis = [np.nanmean(ahrs.estimate(r).estimate.innovations["accelerometer"].nis[1000:]) for r in (whole, lost)]
+    assert nis[1] == pytest.approx(nis[0], rel=0.1)
 
 
 @pytest.mark.parametrize(("bias", "said"), [(0.05, True), (0.001, False)])

@@ -49,7 +49,7 @@ without factory calibration. It is multiplied by that ratio, and the smoother st
 MAX_STARTS = 3
 """Maximum number of such starts."""
 SMALL_TURN = 0.5 * DEGREE
-"""σ of an uncertain rotation, rad, below which it is added to the attitude's with those that follow."""
+"""σ of an uncertain rotation, rad, below which it is added to the attitude's with those that follow, and hardly shows in innovations."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -347,7 +347,8 @@ def _at_stamps(
     ahead = -sensor_delays.turn_over(used, -delays.gyro) if options.smooth else used.rate * delays.gyro
     interval = max(parameters.step, used.interval)
     scales = regions.scales(filtered, density, parameters, causal=not options.smooth)
-    level = regions.acceleration_level(filtered, np.asarray(prepared.turn_variance.any(axis=1)), interval)
+    uncertain = prepared.turn_variance.max(axis=1) > SMALL_TURN**2
+    level = regions.acceleration_level(filtered, uncertain, interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:
