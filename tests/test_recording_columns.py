@@ -128,6 +128,20 @@ def test_two_header_rows_are_one_of_names_and_units(table):
     assert recording.magnetic_unit == "nT"
 
 
+@pytest.mark.parametrize("unit", ["a.u.", "(a.u.)", "local_flux"])
+def test_a_field_in_arbitrary_units_declares_none(table, unit):
+    """As of Xsens, and of Shimmer below the names."""
+    bracketed = unit if unit.startswith("(") else f"[{unit}]"
+    recording = read(table(f"time,gx [dps],gy,gz,ax [g],ay,az,Mag_X {bracketed},Mag_Y {bracketed},Mag_Z {bracketed}"))
+    np.testing.assert_array_equal(recording.magnetic_field, VALUES[:, 7:])
+    assert recording.magnetic_unit == ""
+    plain = unit.strip("()")
+    units = f"ms\tdeg/s\tdeg/s\tdeg/s\tm/(s^2)\tm/(s^2)\tm/(s^2)\t{plain}\t{plain}\t{plain}\t"
+    recording = read(table("time\tgx\tgy\tgz\tax\tay\taz\tmx\tmy\tmz\t", units, separator="\t"))
+    np.testing.assert_array_equal(recording.specific_force, VALUES[:, 4:7])
+    assert recording.magnetic_unit == ""
+
+
 ODD = "when,u1,u2,u3,f1,f2,f3,n1,n2,n3"
 
 

@@ -54,15 +54,19 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "temperature": {"degC": 1.0},
 }
 """Units by group, with their factors to SI."""
+ARBITRARY = "a.u."
+"""Unit of a field that is as good as none."""
 
 _SPELLINGS = {
     "time": {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us", "nsec": "ns"}
     | {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"},
     "gyro": {"dps": "deg/s", "mdps": "mdeg/s", "rads-1": "rad/s", "rads": "rad/s", "rad": "rad/s", "degs-1": "deg/s"}
     | {"degs": "deg/s", "degpers": "deg/s", "radpers": "rad/s", "mrads": "mrad/s", "mdegs": "mdeg/s"},
-    "accelerometer": {"ms-2": "m/s2", "m/s/s": "m/s2", "ms2": "m/s2", "mpers2": "m/s2", "milli-g": "mg", "gs": "g"},
+    "accelerometer": {"ms-2": "m/s2", "m/s/s": "m/s2", "ms2": "m/s2", "mpers2": "m/s2", "m/(s2)": "m/s2"}
+    | {"milli-g": "mg", "gs": "g"},
     "magnetometer": {"microtesla": "uT", "nanotesla": "nT", "gauss": "G", "ga": "G", "milligauss": "mG", "mgauss": "mG"}
-    | {"tesla": "T", "mga": "mG", "ut": "uT", "nt": "nT", "g": "G", "mg": "mG"},
+    | {"tesla": "T", "mga": "mG", "ut": "uT", "nt": "nT", "g": "G", "mg": "mG"}
+    | {"au": ARBITRARY, "localflux": ARBITRARY},
     "temperature": {"c": "degC", "celsius": "degC", "degc": "degC"},
 }
 """Other spellings of units, without spaces and in lower case."""
@@ -248,7 +252,7 @@ def _roles(
         group = _group(role)
         if unit and group in UNITS:
             unit = unit_of(group, unit) or unit
-            if declared.setdefault(group, unit) != unit:
+            if unit != ARBITRARY and declared.setdefault(group, unit) != unit:
                 raise InputError(
                     f"{source}: column {columns[k].name} is in {unit} but another {group} column in {declared[group]}; "
                     "give all axes of one sensor the same unit"
