@@ -250,6 +250,16 @@ def test_what_is_none_of_these_things_is_refused_in_words(call):
 def test_a_refused_object_is_named_by_its_class_and_a_text_in_place_of_names_as_such():
     with pytest.raises(sd.InputError, match="content is of class GyroSpec, not of class ImuRecord or Recording"):
         sd.write(scenario().gyro, "x.h5")
+    estimate = sd.estimate(sd.simulate(scenario(5.0)))
+    with pytest.raises(
+        sd.InputError, match="setup is of class Estimate, not of class FilterSetup or LiveAhrs or str or PathLike"
+    ):
+        sd.export(estimate, folder="x")
+    recording = sd.recordings.Recording(source="walk", time=[0.0, 1.0], rate=np.zeros((2, 3)))
+    with pytest.raises(
+        sd.InputError, match="record is of class Recording, not of class ImuRecord; causes are searched for in"
+    ):
+        sd.diagnose(estimate, recording)
     with pytest.raises(sd.InputError, match=r"states is 'gyro\.scale', a text; give .* \['gyro\.scale'\]"):
         sd.estimate(sd.simulate(scenario(5.0)), states="gyro.scale")
 

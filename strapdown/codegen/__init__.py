@@ -100,6 +100,7 @@ def export(
     >>> sd.export(setup, [up], folder="firmware", precision="single")  # doctest: +SKIP
     >>> sd.export("hand", rate=100.0, magnetometer=True, folder="firmware", precision="single")  # doctest: +SKIP
     """
+    instance("setup", setup, (FilterSetup, LiveAhrs, str, os.PathLike), "give one of these")
     one_of("to", to, ("c", "js"))
     one_of("precision", precision, ("double", "single"))
     if to == "js" and precision == "single":

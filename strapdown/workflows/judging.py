@@ -111,6 +111,7 @@ def diagnose(
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
+    instance("record", record, ImuRecord, "causes are searched for in a record with its specification")
     filter_setup = result.setup
     if filter_setup is None:
         raise InputError("the estimate does not contain its filter; give one made by estimate")
