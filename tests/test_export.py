@@ -361,6 +361,17 @@ def test_the_example_and_the_header_of_the_export(tmp_path):
     assert run.stdout.startswith("attitude ")
 
 
+def test_a_compiler_that_presumes_finite_numbers_is_refused(tmp_path):
+    """With -ffast-math a sample that is not a number passed the tests, and the attitude was none from then on."""
+    record, setup, _ = case("gate")
+    sd.export(setup, record, folder=tmp_path)
+    build = [compiler(), *STRICT, "-O2", "-c", "strapdown_filter.c", "-ffast-math"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "compile with -fno-finite-math-only" in done.stderr
+    subprocess.run([*build, "-fno-finite-math-only"], cwd=tmp_path, check=True)
+
+
 ARDUINO = "#include <stdint.h>\nunsigned long micros();\n"
 AROUND_A_SKETCH = """
 #include "Arduino.h"

@@ -195,10 +195,17 @@ def whole_bias(program: Program, axis: int, words: Language) -> str:
     return text.replace("->", words.member)
 
 
+FINITE_MATH = """
+#if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "invalid samples would not be refused: compile with -fno-finite-math-only, without /fp:fast"
+#endif
+"""
+
+
 def source(program: Program, functions: list[Target], origin: str, *, single: bool) -> str:
     """Return the source."""
     words = language(single=single)
-    out = ["/*", wrapped(origin), " */", '#include "strapdown_filter.h"', "", "#include <math.h>", ""]
+    out = ["/*", wrapped(origin), " */", '#include "strapdown_filter.h"', "", "#include <math.h>", FINITE_MATH]
     if program.recording is not None:
         out += ["static const strapdown_real missing[3] = {0};", ""]
     for function in functions:
