@@ -317,6 +317,9 @@ def test_a_row_for_each_sensor_is_one_recording(csv):
     recording = read(csv(f"{HEADER},temperature", rows))
     np.testing.assert_array_equal(recording.temperature, [20.0, 21.0, 22.0, 23.0])
     np.testing.assert_array_equal(recording.rate[:, 0], range(4))
+    assert recording.left_out_words.endswith(
+        "and other samples in them moved to the nearest row."
+    )  # no rotation is lost
     np.testing.assert_array_equal(recording.specific_force, [[k, 2, 9] for k in range(4)])
 
 

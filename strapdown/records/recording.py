@@ -199,7 +199,7 @@ class Recording(Listed):
         if len(self.missing_gyro):
             words.append(
                 f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out, "
-                "and other samples in them moved to the nearest row: the rotation across them comes from the samples before and after."
+                "and other samples in them moved to the nearest row."
             )
         if len(self.repeated):
             words.append(
