@@ -112,7 +112,7 @@ REFUSED = {
     "unknown force unit": (HEADER.replace("m/s2", "ft/s2"), ROWS, "unit of the accelerometer 'ft/s2' is not known"),
     "two units": ("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az", ROWS, "column gy is in deg/s", "rad/s", "same unit"),
     "missing axis": ("time,gx [rad/s],gy,ax [g],ay,az", ["0,1,2,3,4,5"], "lacks gz", "it has: time, gx, gy, ax, ay, az"),
-    "missing time": ("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"], "lacks time"),
+    "missing time": ("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"], "lacks time", "or write one: the number"),
     "semicolons": ("time;gx;gy;ax;ay;az", ["0;1;2;3;4;5"], "lacks gz", "`columns={'gz': 'NAME'}`"),
     "doubled column": ("time,gx [rad/s],gy,gz,ax [g],ay,az,GX", ROWS, "column 'gx' twice"),
     # A slip of the pen, and a heading that nobody measures is a quiet way to fail.
@@ -156,6 +156,7 @@ REFUSED = {
         [f"{1.7e9 + 0.01 * k:.10g},{0.1 * k},0,0,0,0,9" for k in range(300)],
         "rows with the stamp of the row before and other samples: 296 of 300, the first 0 s in row 2",
         "write the stamps with more digits",
+        "space evenly those of samples that came together",
     ),
     "repeated": (HEADER, [*ROWS[:2], "0.01" + 6 * ",0.5"], "other samples: 1 of 3, the first 0.01 s in row 3", "drop them"),
     "no stamp": (HEADER, [ROWS[0], ",0,0,0,0,0,9"], "time[1] is nan"),

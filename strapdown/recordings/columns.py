@@ -191,6 +191,7 @@ def _need_whole_groups(source: str, header: Sequence[Column], roles: Mapping[str
             raise InputError(
                 f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(column.name for column in header)}); "
                 f"name the columns, as in {Hint('columns', {missing[0]: 'NAME'})}"
+                + (", or write one: the number of the sample over the sample rate, s" if group == "time" else "")
             )
 
 

@@ -260,7 +260,8 @@ def _one_row_a_stamp(source: str, columns: dict[str, Any]) -> dict[str, Any]:
         k = int(np.argmax(other))
         raise InputError(
             f"{source}: rows with the stamp of the row before and other samples: {other.sum()} of {len(time)}, the first "
-            f"{time[k]:.9g} s in row {k + 1}; drop them, or write the stamps with more digits"
+            f"{time[k]:.9g} s in row {k + 1}; drop them, write the stamps with more digits, or space evenly those of samples that came "
+            "together"
         )
     return columns | merged | {"repeated": time[~used]}
 
