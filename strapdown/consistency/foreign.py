@@ -192,13 +192,7 @@ def check_attitudes(
     wanted = _wanted(align)
     whole, alignment = align_series(whole, theirs, wanted, remarks)
     common, true = at_common_times(whole, theirs, alignment.offset)
-    if len(common.time) < FEW_IN_COMMON * min(len(whole.time), len(theirs.time)):
-        lasts, last = np.ptp(whole.time), np.ptp(theirs.time)
-        remarks.append(
-            f"the estimate lasts {lasts:.4g} s and the truth {last:.4g} s, with only {len(common.time)} times in common; "
-            "check the unit of time"
-        )
-    remarks += alignment.words
+    remarks += [*_words_on_few_times(len(common.time), whole, theirs), *alignment.words]
     aligned, true = in_common_frames(common.attitude, true, *alignment.turns)
     reading = _Reading("", {})
     if whole.covariance is not None:
@@ -229,6 +223,15 @@ def check_attitudes(
         remarks=tuple(remarks),
         accuracy=accuracy_of(whole, theirs, None if wanted is None else alignment),
     )
+
+
+def _words_on_few_times(common: int, own: Series, theirs: Series) -> Iterator[str]:
+    """Yield a doubt about the unit of time if few times are in common."""
+    if common < FEW_IN_COMMON * min(len(own.time), len(theirs.time)):
+        yield (
+            f"the estimate lasts {np.ptp(own.time):.4g} s and the truth {np.ptp(theirs.time):.4g} s, with only {common} times in common; "
+            "check the unit of time"
+        )
 
 
 def _without_truth(own: Attitudes, how: Mapping[str, Any]) -> Checked:
