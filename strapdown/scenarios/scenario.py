@@ -109,6 +109,10 @@ class Scenario(ByValue):
     def __post_init__(self) -> None:
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
+        if round(self.duration * self.rate) == 0:
+            raise InputError(
+                f"{self.duration:g} s at {self.rate:g} Hz contain no gyro sample; lengthen the run or raise the rate"
+            )
         if self.duration * self.rate > MAX_SAMPLES:
             raise InputError(
                 f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MAX_SAMPLES:.0e}; "
