@@ -56,6 +56,7 @@ def two_gyros(**change):
 # fmt: off
 TABLE = [
     (free, (), {}, "no parameter"),
+    (workflows.tune, (ONE.record,), {"setup": BELIEVED, "free": []}, "free names no parameter; give some of gyro.arw"),
     (free, ("gyro.awr",), {}, "did you mean 'gyro.arw'"),
     (free, ("gyro.arw", "gyro.arw"), {}, "free names gyro.arw twice"),
     (free, ("star 3.sigma",), {}, "star 1.sigma"),

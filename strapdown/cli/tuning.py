@@ -34,11 +34,9 @@ class _Filter:
         from strapdown.workflows.filters import gyro_of
 
         names = [name.strip() for name in ",".join(self.free or ()).split(",") if name.strip()]
-        if self.free and not names:
-            raise InputError(f"--free is {','.join(self.free)!r} and names no parameter; name some, or leave it out")
         setup = self.filter_file and sd.estimation.setup.read_setup(self.filter_file)
         priors = self.prior and gyro_of(self.prior)
-        return {"setup": setup, "free": names or None, "states": self.states, "priors": priors}
+        return {"setup": setup, "free": names if self.free else None, "states": self.states, "priors": priors}
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,8 @@ def tune(
     if not truth and any(isinstance(source, Recording) for source in by_name.values()):
         free, spacing = tuning.by_innovations(free, spacing, gate=gate, priors=priors)
     names = [name for name in free or () if name not in tuning.GATED]
-    names = names or list(tuning.default_names([case.record for case in cases]))
+    if free is None or (free and not names):
+        names = list(tuning.default_names([case.record for case in cases]))
     if not own or any(name.startswith(("gyro.", "filter.")) for name in names):
         origins = {label: case.record.origin for label, case in zip(by_name, cases, strict=True)}
         tuning.one_gyro({label: origin.gyro for label, origin in origins.items() if origin and origin.gyro})
