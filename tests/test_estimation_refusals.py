@@ -120,10 +120,10 @@ def live(sensors):
     return LiveFilter(NOISE, start(), sensors=sensors)
 
 
-def stepped(blocks=(), update=None, **options):
+def stepped(blocks=(), update=None, k=0, **options):
     f = StepFilter(NOISE, start(), blocks, **options)
     if update is not None:
-        f.update(update)
+        f.update(update, k)
 
 
 def banked(**options):
@@ -147,6 +147,7 @@ def changed_setup(**changes):
 
 
 MAG_BIAS = VectorBias(sensor="mag", bias_sigma=1.0)
+UP_SAMPLE = sample("direction", X, X, 0.1, "up")
 TABLE = [
     (noise, {"angle_random_walk": 0.0}, "angle_random_walk"),
     (noise, {"angle_random_walk": 1e200}, "angle_random_walk is 1e+200"),
@@ -231,10 +232,13 @@ TABLE = [
     (predicted, {"dt": -0.1}, "dt is -0.1 s"),
     (predicted, {"dt": 0.1, "delta_theta": [0.0, np.nan, 0.0]}, "delta_theta[1] is nan"),
     (predicted, {"dt": 0.01, "delta_theta": [0.0, 1e200, 0.0]}, "too large for the rotation"),
+    (predicted, {"dt": 0.0, "delta_theta": [0.1, 0.0, 0.0]}, "dt is 0 s"),
     (predicted, {"dt": 0.01, "delta_theta": [0.0, -2e6, 0.0]}, "too large for the rotation"),
     (stepped, {"update": np.array([0.5, 0.0])}, "not of class VectorMeasurements"),
     (lambda: StepFilter(NOISE, start()).predict_update(X, lambda x: X), {}, "not of class VectorMeasurements"),
     (stepped, {"blocks": MAG_BIAS}, "give a tuple"),
+    (stepped, {"update": UP_SAMPLE, "k": 1}, "k is 1, but the series of up has 1 samples"),
+    (stepped, {"update": UP_SAMPLE, "k": -1}, "k is -1"),
     (
         stepped,
         {"blocks": (MAG_BIAS,), "sensors": ("acc", "Mag"), "update": sample("direction", X, X, 0.1, "mag")},

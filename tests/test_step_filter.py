@@ -159,7 +159,7 @@ def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
         assert f.update(series) is False
     assert f.skipped == {"s": 2}
     assert np.array_equal(f.P, P)
-    with pytest.raises(IndexError):
+    with pytest.raises(InputError, match="k is 1"):
         f.update(series, 1)
 
 

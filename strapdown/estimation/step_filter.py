@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError, array, instance, non_negative, one_of
+from strapdown.checks import Array, InputError, array, count, instance, one_of, positive
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates, temperature_slopes
 from strapdown.estimation.features import refuse
@@ -102,9 +102,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Raises
         ------
         InputError
-            If the duration is negative, or the increment is too large to be an angle.
+            If the duration is not positive, or the increment is too large to be an angle.
         """
-        left, dt = array("delta_theta", delta_theta, (3,)), non_negative("dt", dt, unit="s")
+        left, dt = array("delta_theta", delta_theta, (3,)), positive("dt", dt, unit="s")
         if np.max(np.abs(left)) > LARGEST_TURN:
             raise InputError(
                 f"delta_theta is {left}, too large for the rotation between two samples; it is the rate times dt, rad: check the unit"
@@ -154,11 +154,15 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Raises
         ------
         InputError
-            If the sensor is none of those named, or its noise is zero.
+            If the sensor is none of those named, the series has no sample k, or its noise is zero.
         """
         instance("series", series, VectorMeasurements, "give a series, as in the vectors of a record")
         if self.sensors:
             one_of("sensor", series.sensor, self.sensors)
+        if count("k", k, minimum=0) >= len(series.time):
+            raise InputError(
+                f"k is {k}, but the series of {series.sensor} has {len(series.time)} samples, counted from 0"
+            )
         sample = series.taken([k])
         events = schedule((sample,), -np.inf, np.inf)
         z = tuple(events.vector_b[0].tolist()) if len(events.time) and series.kind != "attitude" else (0.0, 0.0, 0.0)
