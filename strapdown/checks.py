@@ -194,6 +194,12 @@ def by_axis(name: str, value: ArrayLike, remedy: str = "") -> Array:
     )
 
 
+def half_turn(name: str, sigma: ArrayLike) -> None:
+    """Raise an error for a σ of an attitude error, rad, of more than π, the largest rotation."""
+    if (largest := float(np.max(sigma))) > np.pi:
+        raise InputError(f"{name} is {largest:g} rad; no attitude error is larger than π, 180°: check its unit")
+
+
 def fraction(name: str, value: float) -> float:
     """Return ``value`` as a float between 0 and 1, both excluded."""
     number = finite(name, value)

@@ -596,7 +596,7 @@ def begun_off(record, axis, angle, rng):
     """A start turned by an angle, with a covariance of any size."""
     return estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(angle * axis / np.linalg.norm(axis))),
-        attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
+        attitude_sigma=min(10.0 ** rng.uniform(-3.0, 1.0), np.pi),
         bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
     )
 

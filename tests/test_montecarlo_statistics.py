@@ -405,6 +405,7 @@ def test_every_part_of_a_plan_counts_in_its_digest():
         (lambda: montecarlo.run_plan(PLAN, runs=1, threads=0), "threads is 0"),
         (lambda: montecarlo.run_plan(PLAN, runs=1, machine="lane"), "did you mean 'lanes'"),
         (lambda: montecarlo.Dispersions(scale_factor_sigma=-1.0), "scale_factor_sigma is -1"),
+        (lambda: montecarlo.Dispersions(attitude_sigma=10.0), "attitude_sigma is 10 rad"),
         (lambda: montecarlo.read_dispersions("none.toml"), "does not exist"),
         (
             lambda: montecarlo.merge(scalar.run_chunk(PLAN, 0, 1), scalar.run_chunk(planned(epochs=3), 0, 1)),

@@ -106,6 +106,7 @@ CONSIDER = ["covariance", "short.toml", "--consider"]
         ([*CONSIDER, "star 1.bias=x"], "--consider star 1.bias is 'x'; give a number"),
         ([*CONSIDER, "scale_factor=-1"], "--consider scale_factor is -1; it must not be negative"),
         ([*CONSIDER, "initial.bias=-2"], "--consider initial.bias is -2"),
+        ([*CONSIDER, "initial.attitude=200"], "initial_attitude_sigma is 3.49066 rad"),
         ([*CONSIDER, "scale_factor=1e300"], "scale_factor is 1e+294; no error is larger"),
         ([*CONSIDER, "g_sensitivity=1e300"], "g_sensitivity is"),
         ([*CONSIDER, "initial.bias=1e300"], "initial_bias_sigma is"),

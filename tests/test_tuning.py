@@ -490,6 +490,11 @@ def test_searches_that_have_not_begun_end_with_an_interruption(monkeypatch):
     assert len(searches) < 20
 
 
+def test_a_search_keeps_the_initial_attitude_within_half_a_turn():
+    objective = tuning.likelihood([case()], BELIEVED, ["initial.attitude"])
+    assert objective.setup(np.log([10.0])).attitude_sigma == np.pi
+
+
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
     factor = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
     simulated_case = case()

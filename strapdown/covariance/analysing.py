@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array
+from strapdown.checks import Array, half_turn, non_negative
 from strapdown.covariance.consider import Consider, check_considered, checked_size
 from strapdown.covariance.deterministic_errors import (
     MIN_ERROR,
@@ -91,7 +91,7 @@ def analyse(
     check_considered(scenario, consider)
     attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
     bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
-    checked_size("initial_attitude_sigma", attitude_sigma, unit="rad")
+    half_turn("initial_attitude_sigma", non_negative("initial_attitude_sigma", attitude_sigma, unit="rad"))
     checked_size("initial_bias_sigma", bias_sigma, unit="rad/s")
     path = trajectory_of(scenario, setup, epochs)
     fixed = fixed_errors(scenario, setup, path)

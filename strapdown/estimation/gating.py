@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown.checks import Array, count, fraction, one_of, positive
+from strapdown.checks import Array, count, fraction, half_turn, one_of, positive
 from strapdown.kernels.gate_rules import UNIFORM_SIGMA
 
 LOCK_OUT = 10
@@ -72,7 +72,8 @@ class Gate:
         fraction("gate: probability", self.probability)
         if self.recovery is not None:
             count("gate: recovery", self.recovery, minimum=2)
-        positive("gate: restart_attitude_sigma", self.restart_attitude_sigma, unit="rad")
+        name = "gate: restart_attitude_sigma"
+        half_turn(name, positive(name, self.restart_attitude_sigma, unit="rad"))
         if self.restart_bias_sigma is not None:
             positive("gate: restart_bias_sigma", self.restart_bias_sigma, unit="rad/s")
 

@@ -17,6 +17,7 @@ from strapdown.checks import (
     array,
     by_axis,
     covariance,
+    half_turn,
     instance,
     non_negative,
     positive,
@@ -166,7 +167,7 @@ def initial_state(
     Raises
     ------
     InputError
-        If a σ is not positive, a shape is wrong, or the quaternion is not of unit length.
+        If a σ is not positive, that of the attitude exceeds π, a shape is wrong, or the quaternion is not of unit length.
 
     Examples
     --------
@@ -176,6 +177,7 @@ def initial_state(
     [0.01, 0.01, 0.01, 1e-08, 1e-08, 1e-08]
     """
     sigma = np.concatenate([by_axis("attitude_sigma", attitude_sigma), by_axis("bias_sigma", bias_sigma)])
+    half_turn("attitude_sigma", sigma[:3])
     return State(
         attitude=array("attitude", attitude, (4,)), bias=array("bias", bias, (3,)), covariance=np.diag(sigma**2)
     )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, InputError, array, count, instance, non_negative
+from strapdown.checks import Array, InputError, array, count, half_turn, instance, non_negative
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
@@ -60,6 +60,7 @@ class Dispersions(ByValue):
         for name, unit in (("attitude_sigma", "rad"), ("bias_sigma", "rad/s")):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
+        half_turn("dispersions: attitude_sigma", self.attitude_sigma or 0.0)
         for name in ("attitude_error", "bias_error"):
             object.__setattr__(self, name, array(f"dispersions: {name}", getattr(self, name), (3,)))
         for name, unit in (("scale_factor_sigma", ""), ("misalignment_sigma", "rad"), ("turn_on_bias_sigma", "rad/s")):

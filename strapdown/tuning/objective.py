@@ -173,7 +173,9 @@ class Objective:
         )
 
     def _bounded(self, name: str, value: float) -> float:
-        """Return the value of a parameter of error states, limited to its range."""
+        """Return the value of a parameter, limited to its range."""
+        if name == INITIAL_ATTITUDE:
+            return min(value, np.pi)
         if name in ("gyro.scale_sigma", "gyro.misalignment_sigma") or name.endswith(".mounting_sigma"):
             return min(value, LARGEST_SCALE)
         if not name.endswith("_time"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from strapdown import coning, units
-from strapdown.checks import Hint, InputError, instance, one_of, positive
+from strapdown.checks import Hint, InputError, half_turn, instance, one_of, positive
 from strapdown.estimation.filters import MEKF
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
@@ -50,7 +50,7 @@ class FilterSetup(ByValue):
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     attitude_sigma : float, default 1°
-        Standard deviation of the initial attitude error, rad, per axis; a Monte Carlo draws the true error from it.
+        Standard deviation of the initial attitude error, rad, per axis, at most π; a Monte Carlo draws the true error from it.
     bias_sigma : float
         Standard deviation of the initial bias error, rad/s, per axis; a Monte Carlo draws the true error from it.
     integration : strapdown.coning.Algorithm, default "one-sample"
@@ -89,7 +89,7 @@ class FilterSetup(ByValue):
         instance("integration", self.integration, coning.Algorithm, 'give one of coning.ALGORITHMS["name"]')
         if self.states is not None:
             instance("states", self.states, States, "or None")
-        positive("attitude_sigma", self.attitude_sigma, unit="rad")
+        half_turn("attitude_sigma", positive("attitude_sigma", self.attitude_sigma, unit="rad"))
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
         sigma = {str(name): sensor_sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
