@@ -80,7 +80,7 @@ def test_noise_is_given_by_axes_or_by_covariance():
 
 @pytest.mark.parametrize("unit", [1.0, 2e-5])
 def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
-    """filterpy's y and S are in the unit of the reference, and what they lead to does not depend on it."""
+    """filterpy's y, R and S are in the unit of the reference, and what they lead to does not depend on it."""
     reference, value = unit * np.array([0.0, 0.6, -0.8]), unit * np.array([0.05, 0.58, -0.83])
     f = StepFilter(NOISE, start())
     assert f.update(sample("vector", value, reference, 0.01 * unit, "mag"))
@@ -91,6 +91,7 @@ def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
     np.testing.assert_allclose(f.bias, estimate.bias[0], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(f.P, estimate.covariance[0], rtol=1e-9, atol=1e-15)
     assert np.linalg.norm(f.y) == pytest.approx(np.linalg.norm(value - reference), rel=1e-9)
+    np.testing.assert_allclose(f.R, (0.01 * unit) ** 2 * np.eye(3), rtol=1e-12, atol=1e-15 * unit**2)
     for nis in (f.nis, f.y @ np.linalg.solve(f.S, f.y)):
         assert nis == pytest.approx(estimate.innovations["mag"].nis[0], rel=1e-9)
 

@@ -33,7 +33,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     It is the filter of :mod:`strapdown.estimation`; motion model and rows are the kernels' functions, run as plain Python. ``x`` is the
     error state (δθ, δb, δc) (n,): zero before and after each update, because the correction goes into ``attitude``, ``bias`` and
-    ``values``; ``x_post`` stores the last correction. Rows of ``y`` and ``S`` are in the unit of the measurement, or rad.
+    ``values``; ``x_post`` stores the last correction. Rows of ``y``, ``R`` and ``S`` are in the unit of the measurement, or rad.
 
     Parameters
     ----------
@@ -194,7 +194,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _correct(self, residual: Array, H: Array, R: Array) -> None:
         """Correct attitude, bias and error states by filterpy's update; P is then the covariance in the tangent space there."""
-        super().update(residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R)
+        self.R = R
+        super().update(residual, HJacobian=lambda x: H, Hx=lambda x: H @ x)
         correction, self.x = self.x, np.zeros(len(self.x))
         before = self.attitude
         self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
