@@ -17,7 +17,7 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
-from strapdown.units import STANDARD_GRAVITY
+from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from strapdown.allan import NoiseFit
@@ -108,9 +108,14 @@ def matched_filter(
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter that matches a record's specifications, with ``changes`` of its fields, and remarks on errors and their states."""
     filter_setup = dataclasses.replace(setups.FilterSetup.for_record(record, spec, states=states), **(changes or {}))
-    if states is False or (states is None and filter_setup.states is None):
-        return filter_setup, setups.unmodelled_words(record.origin, filter_setup)
     notes = []
+    if spec is not None and not np.any([spec.turn_on_bias, np.broadcast_to(spec.turn_on_bias_sigma, 3)]):
+        notes.append(
+            "The specification of the gyro has no turn-on bias, so its bias at the start is taken as zero, "
+            f"±{filter_setup.bias_sigma / DEGREE_PER_HOUR:.3g} °/h (1 σ): add turn_on_bias_sigma to it."
+        )
+    if states is False or (states is None and filter_setup.states is None):
+        return filter_setup, notes + setups.unmodelled_words(record.origin, filter_setup)
     if record.origin is None or record.origin.scenario is None:
         notes.append(
             "The record does not contain its scenario, so the errors of its sensors are unknown: no state for them."
