@@ -725,6 +725,20 @@ def test_innovations_that_will_contradict_the_filter_are_named():
     )
 
 
+def test_errors_that_contradict_the_filter_only_before_the_end_are_named():
+    """A gyro of one sample a second in a tumble of 4 °/s: a Monte Carlo of 4000 runs has an ANEES of the bias of 1.40 at 390 s."""
+    slow = dataclasses.replace(load_scenario("cubesat"), rate=1.0)
+    analysis = covariance.analyse(slow, epochs=20)
+    k = int(np.argmax(analysis.expected_nees[:, 2]))
+    assert analysis.expected_nees[k, 2] == pytest.approx(1.40, abs=0.03)
+    root, time = np.sqrt(analysis.expected_nees[k, 2]), analysis.time[k]
+    assert analysis.words == (
+        f"The filter will be optimistic in bias: √NEES is {root:.3g} at {time:g} s, though not at the end."
+    )
+    certain = covariance.analyse("cubesat", initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=5)
+    assert certain.words.startswith("The filter will be pessimistic at 0 s, though not at the end: ")
+
+
 def test_only_an_error_that_is_drawn_in_every_run_is_said_to_average_out():
     scenario, belief = with_states()
     analysis = covariance.analyse(scenario, belief, epochs=2)

@@ -116,29 +116,42 @@ class Analysis(Listed):
 
     @property
     def words(self) -> str:
-        """Whether the errors at the last epoch and all innovations will be consistent with the filter."""
-        _, attitude, bias = self.expected_nees[-1]
+        """Whether the errors, first of all those at the last epoch, and the innovations will be consistent with the filter."""
         largest = float(max(*self.rms[-1, :3], *self.filter_sigma[-1, :3]))
         if largest > LARGEST_LINEAR:
             return (
                 f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
                 "will be consistent."
             )
+        nees = self.expected_nees[:, 1:]
+        if words := self._contradiction(len(nees) - 1):
+            return words
+        odd = [f"{name} {nis:.3g}" for name, nis in self.expected_nis.items() if not MIN_NEES <= nis <= MAX_NEES]
+        if odd:
+            return f"The errors at the end will agree with σ, but not the innovations: NIS of {', '.join(odd)}."
+        for epoch in (np.argmax(nees.max(axis=1)), np.argmin(nees.min(axis=1))):
+            if words := self._contradiction(int(epoch)):
+                return words
+        return f"{'But for what is left out, the' if self.left_out else 'The'} filter will be consistent."
+
+    def _contradiction(self, epoch: int) -> str:
+        """Return how the errors at an epoch will contradict the filter, in words; empty if they will not."""
+        _, attitude, bias = self.expected_nees[epoch]
+        when = "" if epoch == len(self.time) - 1 else f" at {self.time[epoch]:.6g} s, though not at the end"
         if (worst := max(attitude, bias)) > MAX_NEES:
-            optimistic = f"optimistic in {'bias' if bias > attitude else 'attitude'}: √NEES is {np.sqrt(worst):.3g}."
+            optimistic = (
+                f"optimistic in {'bias' if bias > attitude else 'attitude'}: √NEES is {np.sqrt(worst):.3g}{when}."
+            )
             same = [name not in self.drawn for name in self.fixed]
-            if all(same) or self._nees(self._moment(self.fixed_errors[:, same]))[-1, 1:].max() > MAX_NEES:
+            if all(same) or self._nees(self._moment(self.fixed_errors[:, same]))[epoch, 1:].max() > MAX_NEES:
                 return f"The filter will be {optimistic}"
             return (
                 f"For a unit with exactly the specified constant errors, the filter is {optimistic} Over units (a Monte Carlo draws them) "
                 "it may be consistent."
             )
         if min(attitude, bias) < MIN_NEES:
-            return "The filter will be pessimistic: its σ will be larger than its errors."
-        odd = [f"{name} {nis:.3g}" for name, nis in self.expected_nis.items() if not MIN_NEES <= nis <= MAX_NEES]
-        if odd:
-            return f"The errors at the end will agree with σ, but not the innovations: NIS of {', '.join(odd)}."
-        return f"{'But for what is left out, the' if self.left_out else 'The'} filter will be consistent."
+            return f"The filter will be pessimistic{when}: its σ will be larger than its errors."
+        return ""
 
     @property
     def covariance(self) -> Array:
