@@ -15,7 +15,7 @@ from spin_plan import PLAN, SETUP
 from strapdown import consistency, montecarlo
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
-from strapdown.estimation import ProcessNoise
+from strapdown.estimation import Gate, ProcessNoise
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
@@ -173,6 +173,21 @@ def test_refused_measurements_are_left_out():
     judgement = consistency.judge(replace(result, innovations={"star 1": struck}))
     assert not any(finding.rejected for finding in judgement.findings)
     assert judgement.limits[0] == "20 of 400 measurements of star 1 rejected by the gate"
+
+
+def test_the_nis_of_a_right_filter_with_a_gate_is_one():
+    """A gate removes the largest of its innovations; their mean square is then smaller, not their σ too large."""
+    result, _ = estimate(samples=4000)
+    gate = Gate(probability=0.95)
+    gated = {
+        name: replace(series, weight=np.where(series.nis > gate.thresholds[1], 0.0, 1.0))
+        for name, series in result.innovations.items()
+    }
+    result, rejected = replace(result, innovations=gated), []
+    for filter_setup in (None, replace(SETUP, gate=gate)):
+        findings = consistency.judge(replace(result, setup=filter_setup)).findings
+        rejected.append([finding.rejected for finding in findings if finding.name == "NIS"])
+    assert rejected == [[True, True], [False, False]]
 
 
 def test_a_truth_at_other_times_and_a_level_of_zero_are_refused():

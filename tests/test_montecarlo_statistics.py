@@ -256,6 +256,17 @@ def test_measurements_that_a_gate_refuses_are_counted_apart(monkeypatch):
     assert np.array_equal(total.sensor_nis_sum[0], plain.sensor_nis_sum[0])
 
 
+def test_the_nis_of_a_gated_filter_is_relative_to_that_of_accepted_measurements(monkeypatch):
+    original = setups.run
+    monkeypatch.setattr(
+        setups, "run", lambda record, setup, *rest, **options: original(record, SETUP, *rest, **options)
+    )
+    gated = replace(PLAN, setup=replace(SETUP, gate=estimation.Gate(probability=0.9)))
+    plain, total = (scalar.run_chunk(plan, 0, 3).sensor_nis_sum.sum(axis=1) for plan in (PLAN, gated))
+    # Of an exponential, χ² of two degrees of freedom over two, below its quantile ln 10.
+    np.testing.assert_allclose(plain / total, 1.0 - np.log(10.0) * 0.1 / 0.9, rtol=1e-12)
+
+
 def test_bounds_are_those_that_decide():
     """The level is shared by the ten tests of the verdict, none of which rejects, and within each by its two epochs."""
     sums, epochs = scalar.run_chunk(PLAN, 0, 3), np.array([2, 4])

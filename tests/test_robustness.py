@@ -72,6 +72,13 @@ def test_constants_are_the_quantiles_of_chi_squared():
     assert np.array_equal(Robust(kind="student", degrees_of_freedom=5.0).parameters[:, 1], [6.0, 7.0, 8.0])
 
 
+@pytest.mark.parametrize("degrees", [1, 2, 3])
+@pytest.mark.parametrize("probability", [0.9, 0.999])
+def test_the_mean_nis_of_accepted_measurements_is_that_of_chi_squared_below_the_threshold(degrees, probability):
+    below = chi2.expect(lambda nis: nis / degrees, (degrees,), ub=chi2.ppf(probability, degrees)) / probability
+    assert Gate(probability=probability).mean_nis(degrees) == pytest.approx(below, rel=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["direction", "heading", "attitude"])
 def test_false_alarms_are_as_often_as_asked_for(kind):
     probability = 0.98

@@ -25,6 +25,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
@@ -296,10 +297,11 @@ def judge(
     untested: dict[str, str] = {}
     if missing := int(np.sum(~estimate.known)):
         limits.append(f"no estimate at {missing} of {len(estimate.time)} times, which are not judged")
+    gate = estimate.setup and estimate.setup.gate
     for sensor, innovations in estimate.innovations.items():
         used = innovations.used
         if used.any():
-            findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used])
+            findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used], gate)
             untested[f"{INNOVATIONS}{sensor}"] = ""
         if innovations.refused:
             limits.append(f"{innovations.refused} of {len(used)} measurements of {sensor} rejected by the gate")
@@ -356,9 +358,9 @@ def ratio(
     )
 
 
-def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
+def _of_sensor(sensor: str, white: Array, nis: Array, gate: Gate | None) -> list[Finding]:
     samples, degrees = white.shape
-    mean = float(nis.mean() / degrees)
+    mean = float(nis.mean() / degrees) / (gate.mean_nis(degrees) if gate else 1.0)
     size = ratio("NIS", sensor, mean, degrees, samples, innovation_words(sensor, mean))
     if samples < MIN_SAMPLES:
         return [size]

@@ -84,6 +84,25 @@ class Gate:
 
         return np.asarray(chdtri([1.0, 2.0, 3.0], 1.0 - self.probability))
 
+    def mean_nis(self, degrees: int) -> float:
+        """Return the mean NIS per degree of freedom of the measurements that the gate of a consistent filter accepts: a little below 1.
+
+        ``E[χ²_n | χ²_n < T] = n F_{n+2}(T) / F_n(T)``, F the distribution function, T the threshold.
+
+        Parameters
+        ----------
+        degrees : int
+            Degrees of freedom n of a measurement, 1 to 3.
+
+        Returns
+        -------
+        float
+            Mean, by which a verdict divides the NIS of a filter with this gate.
+        """
+        from scipy.special import chdtr
+
+        return float(chdtr(degrees + 2.0, self.thresholds[degrees - 1])) / self.probability
+
     @property
     def lock_out_limit(self) -> int:
         """Difference of refusals and acceptances of a sensor above which a lock-out is reported."""
