@@ -373,7 +373,7 @@ class Outcome:
         slow = np.flatnonzero(np.quantile(self.error, 0.9, axis=0) > CONVERGED)
         first = slow[-1] + 1 if len(slow) else 0
         epochs = np.linspace(m // 2, m - 1, 5).astype(int)
-        verdict = consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=runs, probability=0.99)
+        verdict = consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=runs, confidence_level=0.99)
         return {
             "case": self.case,
             "filter": self.filter,

@@ -63,7 +63,7 @@ def test_simultaneous_bounds_hold_for_independent_and_for_equal_epochs():
         independent = generator.chisquare(6, size=(20, 100)).mean(axis=1) / 6.0
         equal = np.full(20, generator.chisquare(600) / 600.0)
         for k, mean in enumerate((independent, equal)):
-            wrong[k] += not Verdict(mean=mean, degrees=6, runs=100, probability=0.99).consistent
+            wrong[k] += not Verdict(mean=mean, degrees=6, runs=100, confidence_level=0.99).consistent
     assert 0.002 * trials < wrong[0] < 0.021 * trials  # Bonferroni is nearly exact for independent epochs
     assert wrong[1] < 0.005 * trials  # and conservative for equal ones
 
@@ -101,7 +101,7 @@ def test_p_value_and_bounds_agree():
                 assert consistency.mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-6)
     assert consistency.mean_p_value(math.inf, 6, 10) == 0.0
     assert consistency.mean_p_value(math.nan, 6, 10) == 0.0
-    several = {"degrees": 6, "runs": 50, "probability": 0.99}
+    several = {"degrees": 6, "runs": 50, "confidence_level": 0.99}
     low, high = Verdict(mean=np.ones(4), **several).simultaneous_bounds
     for mean, p in (([1.0, low, 1.0, 1.0], 0.01), ([1.0, 1.0, 1.0, high], 0.01), ([1.0, 1.01, 1.0, 1.0], 1.0)):
         assert Verdict(mean=np.array(mean), **several).p_value == pytest.approx(p, rel=1e-6)

@@ -570,7 +570,7 @@ IRON_STATES = [0, 1, 2, 3, 4, 5, 18, 19, 20]
 def test_hard_iron_needs_a_turn():
     """Still, the field's horizontal part and the heading are one; turned about, all is observable."""
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.3, bias_sigma=5e-3)
-    still = estimation.observability(plain_record(motion.rest()), NOISE, initial, IRON)
+    still = estimation.observability(plain_record(motion.rest()), NOISE, initial, error_states=IRON)
     assert still.rank == 8
     assert still.singular_values[8] < 0.5
     # Heading and what is east in the body: a heading δψ moves the field of 20 µT by 20 µT δψ.

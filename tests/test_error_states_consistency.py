@@ -138,7 +138,7 @@ def judged(
     each = 1.0 - 0.01 / len(parts)
     return {
         name: consistency.Verdict(
-            mean=np.mean(values[name], axis=0) / len(part), degrees=len(part), runs=number, probability=each
+            mean=np.mean(values[name], axis=0) / len(part), degrees=len(part), runs=number, confidence_level=each
         )
         for name, part in parts.items()
     }

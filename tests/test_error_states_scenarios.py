@@ -50,7 +50,7 @@ class Study:
         values = np.array(self.nees[subset])
         degrees = len(consistency.SUBSETS[subset])
         return consistency.Verdict(
-            mean=values.mean(axis=0) / degrees, degrees=degrees, runs=len(values), probability=probability
+            mean=values.mean(axis=0) / degrees, degrees=degrees, runs=len(values), confidence_level=probability
         )
 
 

@@ -494,7 +494,7 @@ def anees(name, kind, form, runs, factor):
         modelled = dataclasses.replace(record, vectors=tuple(series.noise_scaled(factor) for series in record.vectors))
         estimate = comparison.estimated(name, modelled, BELIEF, initial)
         nees.append(consistency.nees(errors(estimate, record.truth)[[6, 12]], estimate.covariance[[6, 12]]) / 6.0)
-    return Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, probability=0.999)
+    return Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, confidence_level=0.999)
 
 
 EVERY_CASE = [("mekf", *case) for case in CASES] + [(n, *case) for n in comparison.NAMES[1:] for case in SIMPLE_CASES]

@@ -87,7 +87,7 @@ def test_a_right_filter_is_consistent(many):
         p = stats.chi2.cdf(total, 1600 * degrees)
         assert (p > 1e-4).all()
         assert (p < 1.0 - 1e-4).all()
-    low, high = many.nis_bounds(0.9999)
+    low, high = many.nis_bounds(confidence_level=0.9999)
     assert low < many.mean_nis < high
     score = many.mean_error / (many.sigma / math.sqrt(1600))
     assert np.abs(score).max() < 4.6

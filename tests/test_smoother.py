@@ -120,7 +120,7 @@ CASES = {
 def check_consistent(nees: np.ndarray, probability: float, degrees: int = 6) -> None:
     """The mean over runs (runs, epochs) lies inside the two-sided bounds of all epochs together."""
     mean = nees.mean(axis=0) / degrees
-    verdict = consistency.Verdict(mean=mean, degrees=degrees, runs=len(nees), probability=probability)
+    verdict = consistency.Verdict(mean=mean, degrees=degrees, runs=len(nees), confidence_level=probability)
     assert verdict.consistent, (mean, verdict.simultaneous_bounds)
 
 

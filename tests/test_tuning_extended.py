@@ -373,7 +373,7 @@ def tuned_and_held_out(name: str, train: int, test: int, seed: int, **changes) -
     for subset, values_of_runs in nees.items():
         degrees = len(consistency.SUBSETS[subset])
         verdict = consistency.Verdict(
-            mean=np.mean(values_of_runs, axis=0) / degrees, degrees=degrees, runs=test, probability=0.998
+            mean=np.mean(values_of_runs, axis=0) / degrees, degrees=degrees, runs=test, confidence_level=0.998
         )
         if not verdict.consistent:
             wrong_ones.append(f"NEES of the {subset}: {verdict.mean} outside {verdict.simultaneous_bounds}")

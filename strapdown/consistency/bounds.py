@@ -127,11 +127,11 @@ def log_mean_distribution(value: float, degrees: int, samples: int) -> float:
     return float(np.clip(0.5 - 0.05 / math.pi * np.sum(np.imag(np.exp(-1j * t * z) * phi) / t), 0.0, 1.0))
 
 
-def log_mean_bounds(degrees: int, samples: int, probability: float = 0.99) -> tuple[float, float]:
+def log_mean_bounds(degrees: int, samples: int, confidence_level: float = 0.99) -> tuple[float, float]:
     """Return exact two-sided bounds of the mean of ``samples`` independent values of ln χ² with ``degrees`` degrees of freedom."""
     from scipy.optimize import brentq
 
-    outside = tail(probability)
+    outside = tail(confidence_level)
     mean, variance = log_moments(degrees)
     reach = 25.0 * math.sqrt(variance / count("samples", samples))
     low, high = (
@@ -166,22 +166,22 @@ class Verdict:
     """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a consistent filter."""
     degrees: int
     runs: int
-    probability: float
+    confidence_level: float
     """Probability that the mean at one epoch lies inside the bounds for a consistent filter."""
 
     @property
     def bounds(self) -> tuple[float, float]:
         """Two-sided bounds of the mean at one epoch."""
-        return mean_bounds(self.degrees, self.runs, self.probability)
+        return mean_bounds(self.degrees, self.runs, self.confidence_level)
 
     @property
     def simultaneous_bounds(self) -> tuple[float, float]:
-        """Two-sided bounds that the means at all epochs of a consistent filter keep jointly with at least ``probability`` (Bonferroni).
+        """Two-sided bounds for the means at all epochs together, with at least ``confidence_level`` (Bonferroni).
 
         Errors at different epochs of one run are correlated, bias errors most of all, so the number of epochs outside :attr:`bounds` is
         not binomial. The Bonferroni bounds hold under any dependence.
         """
-        return mean_bounds(self.degrees, self.runs, 1.0 - (1.0 - self.probability) / len(self.mean))
+        return mean_bounds(self.degrees, self.runs, 1.0 - (1.0 - self.confidence_level) / len(self.mean))
 
     @property
     def outside(self) -> int:

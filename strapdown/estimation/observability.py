@@ -123,7 +123,7 @@ def observability(
     record: ImuRecord,
     process_noise: ProcessNoise,
     initial: State,
-    blocks: Sequence[ErrorStates] = (),
+    error_states: Sequence[ErrorStates] = (),
     *,
     threshold: float = 1.0,
 ) -> Observability:
@@ -140,7 +140,7 @@ def observability(
     process_noise : ProcessNoise
     initial : State
         State at the first edge, with the prior σ.
-    blocks : sequence of ErrorStates, default none
+    error_states : sequence of ErrorStates, default none
         Error states in addition to attitude and bias.
     threshold : float, default 1
 
@@ -154,14 +154,14 @@ def observability(
     InputError
         If an argument is out of range, or an error state belongs to a sensor that the record does not have.
     """
-    blocks = modelling.as_blocks(blocks)
+    error_states = modelling.as_blocks(error_states)
     positive("threshold", threshold)
-    state = modelling.begin(initial, blocks)
-    where = smooth(record, process_noise, state, blocks)
+    state = modelling.begin(initial, error_states)
+    where = smooth(record, process_noise, state, error_states)
     fixed = without_errors(record, where.attitude)
     begin = dataclasses.replace(state, attitude=where.attitude[0], bias=np.zeros(3), values=np.zeros(len(state.values)))
-    whole = smooth(fixed, process_noise, begin, blocks, full_covariance=True)
-    covariance = whole.whole_covariance if blocks else whole.covariance
+    whole = smooth(fixed, process_noise, begin, error_states, full_covariance=True)
+    covariance = whole.whole_covariance if error_states else whole.covariance
     assert covariance is not None
     P = covariance[0]
     sigma = np.sqrt(np.diag(state.covariance))
@@ -171,7 +171,7 @@ def observability(
     left, direction = np.linalg.eigh(inverse @ (P / np.outer(sigma, sigma)) @ inverse)
     left = np.clip(left, 1e-15, 1.0)  # of the prior variance
     directions = (root @ direction).T
-    names, units = state_names(blocks)
+    names, units = state_names(error_states)
     return Observability(
         states=names,
         units=units,

@@ -353,12 +353,12 @@ class Statistics(ByValue, Listed):
         """NIS per degree of freedom of each sensor over the whole time and all runs (s,)."""
         return _divided(self.sensor_nis_sum.sum(axis=1), self.sensor_degrees.sum(axis=1))
 
-    def nis_bounds(self, probability: float = 0.99) -> tuple[float, float]:
+    def nis_bounds(self, confidence_level: float = 0.99) -> tuple[float, float]:
         """Return two-sided bounds of :attr:`mean_nis` of a consistent filter.
 
         Parameters
         ----------
-        probability : float, default 0.99
+        confidence_level : float, default 0.99
             Probability that a consistent filter lies inside the bounds.
 
         Returns
@@ -366,14 +366,14 @@ class Statistics(ByValue, Listed):
         low, high : float
             Bounds per degree of freedom; a mean outside them rejects the filter.
         """
-        return consistency.mean_bounds(1, int(self.sensor_degrees.sum()), probability)
+        return consistency.mean_bounds(1, int(self.sensor_degrees.sum()), confidence_level)
 
     @property
     def nis_interval_bounds(self) -> tuple[float, float]:
         """99 % bounds of :attr:`nis` of a consistent filter in a time bin with the median number of degrees of freedom."""
         return consistency.mean_bounds(1, round(float(np.median(self.nis_degrees[self.nis_degrees > 0]) * self.runs)))
 
-    def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
+    def verdict(self, epochs: NDArray[Any], subset: str = "state", confidence_level: float = 0.99) -> Verdict:
         """Return the two-sided χ² test of the ANEES at given epochs.
 
         The ANEES of an epoch at which some run was not finite is infinite: a filter that fails in a run is not consistent.
@@ -383,7 +383,7 @@ class Statistics(ByValue, Listed):
         epochs : array of int
             Indices of epochs.
         subset : {"state", "attitude", "bias"}
-        probability : float, default 0.99
+        confidence_level : float, default 0.99
             Probability of the bounds at all epochs together.
 
         Returns
@@ -393,7 +393,7 @@ class Statistics(ByValue, Listed):
         """
         column, degrees = SUBSETS[subset]
         mean = np.where(self.finite == self.runs, self.anees[:, column], np.inf)[epochs]
-        return Verdict(mean=mean, degrees=degrees, runs=self.runs, probability=probability)
+        return Verdict(mean=mean, degrees=degrees, runs=self.runs, confidence_level=confidence_level)
 
     def error_quantile(self, probability: float) -> Array:
         """Return a quantile of |e| at each epoch, from the histogram; its error is less than half a bin, 6 %.
@@ -467,8 +467,8 @@ def zeros(plan: Plan) -> dict[str, Any]:
     return {**sums, "time": plan.time, "nis_edges": plan.nis_edges, "sensors": plan.sensors}
 
 
-def _anees(statistics: Statistics, epochs: Counts, subset: str, probability: float, failed: int) -> Finding:
-    verdict = statistics.verdict(epochs, subset, probability)
+def _anees(statistics: Statistics, epochs: Counts, subset: str, confidence_level: float, failed: int) -> Finding:
+    verdict = statistics.verdict(epochs, subset, confidence_level)
     worst = int(np.argmax(np.abs(np.log(np.clip(verdict.mean, 1e-300, 1e300)))))
     value = float(verdict.mean[worst])
     return Finding(
