@@ -8,6 +8,7 @@ import types
 import mpmath
 import numpy as np
 import pytest
+import scipy.signal
 import two_stars
 from measured import series_of
 from scipy.optimize import brentq
@@ -389,6 +390,15 @@ def test_the_sandwich_takes_the_scatter_about_the_mean_and_no_information_is_no_
     assert inverse[0, 0] == pytest.approx(0.25)
     assert np.all(np.diag(inverse)[1:] > 1e9)
     assert np.all(np.diag(sandwich)[1:] > 1e9)
+
+
+def test_correlated_parts_add_up_as_an_autoregressive_process():
+    """Of AR(1) with ρ = 0.5 a sum has three times the variance of independent parts; negative correlation is not used."""
+    noise = np.random.default_rng(0).standard_normal((400_000, 2))
+    parts = scipy.signal.lfilter([1.0], [1.0, -0.5], noise, axis=0)
+    parts[:, 1] = np.diff(noise[:, 1], prepend=0.0)
+    np.testing.assert_allclose(fitting.correlation_factor(parts), [3.0, 1.0], rtol=0.02)
+    assert np.all(np.isfinite(fitting.correlation_factor(np.zeros((20, 2)))))
 
 
 def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():

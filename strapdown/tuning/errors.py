@@ -4,7 +4,7 @@ The likelihood is that of the filter with its error states, gate and robust weig
 
 Errors at neighbouring times are correlated, so epochs are spaced by the correlation time of the attitude error. The likelihood of all of
 them is a composite one (Lindsay 1988): its maximum is consistent, its curvature is not the information, and standard errors come from the
-sandwich.
+sandwich, with the correlation of its parts.
 """
 
 from __future__ import annotations
