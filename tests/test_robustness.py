@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from measured import assert_inside, drawn_start, errors, recoveries, turn_to
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, kstest
 
 from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.estimation import forward, gating
@@ -74,9 +74,18 @@ def test_constants_are_the_quantiles_of_chi_squared():
 
 @pytest.mark.parametrize("degrees", [1, 2, 3])
 @pytest.mark.parametrize("probability", [0.9, 0.999])
-def test_the_mean_nis_of_accepted_measurements_is_that_of_chi_squared_below_the_threshold(degrees, probability):
-    below = chi2.expect(lambda nis: nis / degrees, (degrees,), ub=chi2.ppf(probability, degrees)) / probability
-    assert Gate(probability=probability).mean_nis(degrees) == pytest.approx(below, rel=1e-9)
+def test_accepted_innovations_without_their_gate_are_standard_normal(degrees, probability):
+    white = np.random.default_rng(degrees).standard_normal((20_000, degrees))
+    white = white[np.sum(white**2, axis=1) <= chi2.ppf(probability, degrees)]
+    white[0] = 0.0
+    ungated = Gate(probability=probability).ungated(white)
+    assert kstest(ungated.ravel(), "norm").pvalue > 0.01
+    assert kstest(np.sum(ungated**2, axis=1), chi2(degrees).cdf).pvalue > 0.01
+    if degrees == 2:  # χ² of two degrees of freedom is exponential
+        nis = np.sum(white**2, axis=1)
+        expected = -2.0 * np.log1p(np.expm1(-0.5 * nis) / probability)
+        np.testing.assert_allclose(np.sum(ungated**2, axis=1), expected, rtol=1e-6)
+    assert np.isfinite(Gate().ungated(np.full((1, degrees), 1e3))).all()
 
 
 @pytest.mark.parametrize("kind", ["direction", "heading", "attitude"])

@@ -25,7 +25,6 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
-from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
@@ -301,7 +300,8 @@ def judge(
     for sensor, innovations in estimate.innovations.items():
         used = innovations.used
         if used.any():
-            findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used], gate)
+            white = innovations.whitened[used]
+            findings += _of_sensor(sensor, gate.ungated(white) if gate else white)
             untested[f"{INNOVATIONS}{sensor}"] = ""
         if innovations.refused:
             limits.append(f"{innovations.refused} of {len(used)} measurements of {sensor} rejected by the gate")
@@ -358,9 +358,9 @@ def ratio(
     )
 
 
-def _of_sensor(sensor: str, white: Array, nis: Array, gate: Gate | None) -> list[Finding]:
+def _of_sensor(sensor: str, white: Array) -> list[Finding]:
     samples, degrees = white.shape
-    mean = float(nis.mean() / degrees) / (gate.mean_nis(degrees) if gate else 1.0)
+    mean = float(np.mean(white**2))
     size = ratio("NIS", sensor, mean, degrees, samples, innovation_words(sensor, mean))
     if samples < MIN_SAMPLES:
         return [size]

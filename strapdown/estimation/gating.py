@@ -84,24 +84,26 @@ class Gate:
 
         return np.asarray(chdtri([1.0, 2.0, 3.0], 1.0 - self.probability))
 
-    def mean_nis(self, degrees: int) -> float:
-        """Return the mean NIS per degree of freedom of the measurements that the gate of a consistent filter accepts: a little below 1.
+    def ungated(self, white: Array) -> Array:
+        """Return accepted innovations stretched to their length without the gate: of a consistent filter, standard normal again.
 
-        ``E[χ²_n | χ²_n < T] = n F_{n+2}(T) / F_n(T)``, F the distribution function, T the threshold.
+        The NIS of accepted ones is χ² below the threshold; that of the result is at the same fraction of the whole distribution.
 
         Parameters
         ----------
-        degrees : int
-            Degrees of freedom n of a measurement, 1 to 3.
+        white : ndarray (m, n)
+            Accepted innovations over their standard deviations.
 
         Returns
         -------
-        float
-            Mean, by which a verdict divides the NIS of a filter with this gate.
+        ndarray (m, n)
+            By which a verdict judges a filter with this gate.
         """
-        from scipy.special import chdtr
+        from scipy.special import chdtr, chdtri
 
-        return float(chdtr(degrees + 2.0, self.thresholds[degrees - 1])) / self.probability
+        degrees, nis = white.shape[1], np.maximum(np.sum(white**2, axis=1), np.finfo(float).tiny)
+        beyond = 1.0 - np.minimum(chdtr(degrees, nis) / self.probability, 1.0 - 1e-9)  # also of one used to recover
+        return np.asarray(white * np.sqrt(chdtri(degrees, beyond) / nis)[:, None])
 
     @property
     def lock_out_limit(self) -> int:

@@ -164,10 +164,10 @@ class Sums:
                 continue
             innovations = estimate.innovations[sensor]
             place = np.clip(np.searchsorted(self.sums.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
-            used, degrees, gate = innovations.used, innovations.innovation.shape[1], self.plan.setup.gate
-            nis = innovations.nis[used] / (gate.mean_nis(degrees) if gate else 1.0)
+            used, nis, gate = innovations.used, innovations.nis, self.plan.setup.gate
+            nis = np.sum(gate.ungated(innovations.whitened[used]) ** 2, axis=1) if gate else nis[used]
             self.sums.sensor_nis_sum[i] += np.bincount(place[used], weights=nis, minlength=bins)
-            self.sums.sensor_degrees[i] += np.bincount(place[used], minlength=bins) * degrees
+            self.sums.sensor_degrees[i] += np.bincount(place[used], minlength=bins) * innovations.innovation.shape[1]
             self.sums.sensor_refused[i] += np.bincount(place[~used], minlength=bins)
 
     @property

@@ -147,7 +147,7 @@ class Statistics(ByValue, Listed):
     sensors : tuple of str
         Names of the s sensors, in the scenario's order.
     sensor_nis_sum : ndarray (s, k)
-        Σ NIS of the measurements used, by sensor and time bin; with a gate over its mean (:meth:`Gate.mean_nis`).
+        Σ NIS of the measurements used, by sensor and time bin; with a gate that of :meth:`Gate.ungated`.
     sensor_degrees : ndarray (s, k) of int
         Their degrees of freedom.
     sensor_refused : ndarray (s, k) of int
