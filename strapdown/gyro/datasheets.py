@@ -54,7 +54,9 @@ def parse(name: str, text: str, wanted: str, example: str) -> float:
     registry = _registry()
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example}")
-    plain = re.sub(r"√(\w+)", r"sqrt(\1)", text.replace("°", " deg").replace("″", " arcsec"))
+    number = re.match(r"\s*[±<≤]?\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", text)
+    unit_text = text[number.end() :] if number else text
+    plain = re.sub(r"√(\w+)", r"sqrt(\1)", unit_text.replace("°", " deg").replace("″", " arcsec"))
     symbols = {
         r"\bg\b": "standard_gravity",
         r"\bhr?\b": "hour",
@@ -65,7 +67,13 @@ def parse(name: str, text: str, wanted: str, example: str) -> float:
         plain = re.sub(symbol, unit, plain)
     plain = re.sub(r"sqrt\(((?:[^()]|\([^()]*\))*)\)", r"((\1) ** 0.5)", plain)
     try:
-        quantity = registry.Quantity(plain)
+        if not number:
+            raise ValueError("it does not begin with a number")
+        unit = registry.Quantity(f"1{plain}" if plain.strip()[:1] in ("", "/") else plain)
+        # pint drops characters that it does not know: 1,5 would be 15, 0,34 nothing, and 0.3 – 0.5 their product.
+        if unit.magnitude != 1.0:
+            raise ValueError("it has more than a number and its unit, or no decimal point")
+        quantity = float(number[1]) * unit
         units = quantity.to_root_units().units
     except Exception as error:  # pint raises any of Python's exceptions for a text that is no expression
         raise InputError(
