@@ -58,7 +58,7 @@ class PlainModule:
             names = dict(value.__globals__)
             function = FunctionType(value.__code__, names, value.__name__, value.__defaults__)
             self.made[value] = self.recorded(function) if value in target.OWN else function
-            for name in machine._names(value.__code__):
+            for name in machine.names_of(value.__code__):
                 if name in self.replaced or name in names:
                     names[name] = self.bound(self.replaced.get(name, names.get(name)))
         return self.made[value]

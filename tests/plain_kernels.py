@@ -8,7 +8,7 @@ from typing import Any
 import numba
 
 from strapdown.kernels.compiler import KernelCompiler
-from strapdown.kernels.machine import _defined, _names, helper
+from strapdown.kernels.machine import _defined, helper, names_of
 
 KERNELS = "strapdown.kernels"
 
@@ -29,7 +29,7 @@ def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:
         if original not in copies:
             names = dict(original.__globals__)
             copies[original] = FunctionType(original.__code__, names, original.__name__, original.__defaults__)
-            for name in _names(original.__code__):
+            for name in names_of(original.__code__):
                 value = names.get(name)
                 if isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
                     names[name] = bound(_defined(name, value, original, parts))

@@ -498,6 +498,10 @@ def kernel(a, n, x):
             continue
         q = (q[1], q[0] + a[k, 0])
         count += 1
+    for k in (0, 1, 2):
+        if k == 1 or a[k, 0] > 2.0:
+            continue
+        q = (q[0] + a[k, 1], q[1])
     while count > 0 and q[0] > 1.0:
         q = (0.5 * q[0], q[1])
         count -= 1

@@ -10,15 +10,15 @@ import ast
 import functools
 import inspect
 import math
-import operator
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import FunctionType, MappingProxyType, ModuleType, SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 from strapdown.codegen.functions import Block, Statement
 from strapdown.codegen.symbols import Symbol, Trace, Values
+from strapdown.kernels.machine import names_of
 
 FORMULAS = ("strapdown.kernels", "strapdown.codegen")
 """Packages of functions that are executed on symbols."""
@@ -38,15 +38,16 @@ class Range:
     stop: Any
 
 
-class Bind(NamedTuple):
-    """Assignment of a value to the target of an unrolled loop."""
-
-    target: ast.expr
-    value: Any
-
-
 class Expressions(ast.NodeTransformer):
-    """Replaces what Python decides by the truth of an operand: chains of comparisons, ``and``, ``or``, ``not``, ``a if c else b``."""
+    """Replaces what Python decides by the truth of an operand: chains of comparisons, ``and``, ``or``, ``not``, ``a if c else b``.
+
+    ``a += b`` becomes ``a = a + b``.
+    """
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.stmt:
+        """Assign the result of the operation."""
+        self.generic_visit(node)
+        return ast.Assign([node.target], ast.BinOp(node.target, node.op, node.value))
 
     def visit_Compare(self, node: ast.Compare) -> ast.expr:
         """Join a chain of comparisons."""
@@ -58,12 +59,12 @@ class Expressions(ast.NodeTransformer):
                 parts.append(same if isinstance(sign, ast.Eq) else called("_no_", same))
             else:
                 parts.append(ast.Compare(left, [sign], [right]))
-        return parts[0] if len(parts) == 1 else called("_all_", *parts)
+        return parts[0] if len(parts) == 1 else called("_chain_", *parts)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
         """Evaluate all operands."""
         self.generic_visit(node)
-        return called("_all_" if isinstance(node.op, ast.And) else "_any_", *node.values)
+        return called("_and_" if isinstance(node.op, ast.And) else "_or_", *node.values)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
         """Negate a condition."""
@@ -84,18 +85,17 @@ def called(name: str, *arguments: ast.expr) -> ast.expr:
 
 @functools.cache
 def parsed(function: FunctionType) -> ast.FunctionDef:
-    """Return a kernel's syntax tree."""
+    """Return a kernel's syntax tree, with calls of helpers for what the truth of an operand decides."""
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
-    assert isinstance(node, ast.FunctionDef)
-    return node
+    tree = Expressions().visit(node)
+    assert isinstance(tree, ast.FunctionDef)
+    return tree
 
 
 @functools.cache
-def code_of(node: ast.expr) -> tuple[Any, tuple[str, ...]]:
-    """Return an expression as code, with the names in it; that of a target reads its value."""
-    tree = ast.Expression(Expressions().visit(ast.parse(ast.unparse(node), mode="eval").body))
-    names = {x.id for x in ast.walk(tree) if isinstance(x, ast.Name)}
-    return compile(ast.fix_missing_locations(tree), "<kernel>", "eval"), tuple(sorted(names))
+def code_of(node: ast.expr) -> Any:
+    """Return an expression as code; that of a target reads its value."""
+    return compile(ast.unparse(node), "<kernel>", "eval")
 
 
 def assigned(statements: Sequence[ast.stmt]) -> set[str]:
@@ -117,6 +117,9 @@ def mathematics(trace: Trace) -> dict[str, Any]:
         plain = getattr(math, name)
         return lambda *x: trace.symbol(kind or name, *x) if any(isinstance(t, Symbol) for t in x) else plain(*x)
 
+    def joined(sign: str) -> Callable[..., Any]:
+        return lambda *x: functools.reduce(functools.partial(trace.condition, sign), x)
+
     names = ("sqrt", "exp", "expm1", "sin", "cos", "tan", "asin", "atan2", "trunc")
     space = SimpleNamespace(
         **{name: function(name) for name in names},
@@ -137,8 +140,9 @@ def mathematics(trace: Trace) -> dict[str, Any]:
         "value_at": lambda array, i, like: array[i],
         "put_at": lambda array, i, value: array.__setitem__(i, value),
         "_select_": lambda c, a, b: trace.select(c, a(), b()) if isinstance(c, Symbol) else a() if c else b(),
-        "_all_": lambda *x: functools.reduce(lambda a, b: trace.condition("&&", a, b), x),
-        "_any_": lambda *x: functools.reduce(lambda a, b: trace.condition("||", a, b), x),
+        "_and_": joined("&&"),
+        "_chain_": joined("&&"),
+        "_or_": joined("||"),
         "_no_": lambda x: trace.symbol("not", x) if isinstance(x, Symbol) else not x,
         "_equal_": lambda a, b: trace.symbol("==", a, b) if isinstance(a, Symbol) or isinstance(b, Symbol) else a == b,
     }
@@ -176,8 +180,8 @@ class Interpreter:
         """What is called by these names, on symbols."""
         self.own, self.replaced = own, replaced
         """Functions that become functions of the target; functions that are executed instead of others of the same names."""
-        self.scopes: dict[ast.expr, dict[str, Any]] = {}
-        """Functions and constants that an expression names, by name."""
+        self.scopes: dict[FunctionType, dict[str, Any]] = {}
+        """Functions and constants that a kernel names, by name."""
         self.outer = False
         """Whether the kernel is the function of the target, which may return anywhere."""
         self.loops = True
@@ -213,22 +217,18 @@ class Interpreter:
         node = parsed(function)
         names, defaults = [a.arg for a in node.args.args], function.__defaults__ or ()
         env = dict(zip(names, (*arguments, *defaults[len(arguments) + len(defaults) - len(names) :]), strict=True))
-        env["_globals_"] = function.__globals__
-        result = self._statements(list(node.body), env)
+        if function not in self.scopes:
+            module = function.__globals__ | {n: x for n, x in self.replaced.items() if n in function.__globals__}
+            self.scopes[function] = {n: executed(module[n], self) for n in names_of(function.__code__) if n in module}
+            self.scopes[function] |= self.helpers
+        result = self._statements(list(node.body), self.scopes[function] | env)
         self.outer, self.loops, self.of_filter = before
         return result[0] if result else None
 
     def _value(self, node: ast.expr, env: dict[str, Any]) -> Any:
         """Return the value of an expression."""
-        code, used = code_of(node)
-        if node not in self.scopes:
-            module = {name: value for name, value in env["_globals_"].items() if name in used}
-            module |= {name: value for name, value in self.replaced.items() if name in module}
-            helpers = {name: value for name, value in self.helpers.items() if name in used}
-            self.scopes[node] = {name: executed(value, self) for name, value in module.items()} | helpers
-        names = self.scopes[node] | {name: env[name] for name in used if name in env}
         try:
-            return eval(code, names)
+            return eval(code_of(node), env)
         except Exception as error:
             error.add_note(f"in a kernel: {ast.unparse(node)}")
             raise
@@ -241,25 +241,21 @@ class Interpreter:
             node = items.pop(0)
             if isinstance(node, ast.Return):
                 return (None if node.value is None else self._value(node.value, env),)
-            if isinstance(node, Bind):
-                self._assign(node.target, node.value, env)
-            elif isinstance(node, ast.Assign | ast.AnnAssign):
+            if isinstance(node, ast.Assign | ast.AnnAssign):
                 assert node.value is not None
                 value = self._value(node.value, env)
                 for target in [node.target] if isinstance(node, ast.AnnAssign) else node.targets:
                     self._assign(target, value, env)
-            elif isinstance(node, ast.AugAssign):
-                self._assign(node.target, self._augmented(node, env), env)
             elif isinstance(node, ast.Expr):
-                if not isinstance(node.value, ast.Constant):
-                    self._value(node.value, env)
+                self._value(node.value, env)
             elif isinstance(node, ast.Continue):
                 return ()
             elif isinstance(node, ast.While):
-                condition = self._value(node.test, env)
+                test: Any = node.test
+                condition = self._value(test, env)
                 if isinstance(condition, Symbol):
-                    parts = node.test.values if isinstance(node.test, ast.BoolOp) else [node.test]
-                    self._loop(Statement("loop"), parts, node.body, env)
+                    operands = test.args if isinstance(test, ast.Call) and ast.unparse(test.func) == "_and_" else [test]
+                    self._loop(Statement("loop"), operands, node.body, env)
                 elif condition:
                     items[:0] = [*node.body, node]
             elif isinstance(node, ast.For):
@@ -267,7 +263,10 @@ class Interpreter:
                 if isinstance(values, Range):
                     self._count(values, node, env)
                 else:
-                    items[:0] = [x for value in values for x in (Bind(node.target, value), *node.body)]
+                    assert not contains(node.body, (ast.Return,)), "an unrolled loop is left"
+                    for value in values:
+                        self._assign(node.target, value, env)
+                        self._statements(list(node.body), env)
             elif isinstance(node, ast.If):
                 condition = self._value(node.test, env)
                 if not isinstance(condition, Symbol):
@@ -278,7 +277,6 @@ class Interpreter:
                 else:
                     otherwise = list(node.orelse)
                     if contains(node.body, LEAVING):
-                        assert not any(isinstance(item, Bind) for item in items), "an unrolled loop is left"
                         otherwise, items = otherwise + items, []
                     result = self._branch(condition, (node.body, otherwise), env)
                     if result:
@@ -286,13 +284,6 @@ class Interpreter:
             else:
                 raise TypeError(f"a statement that cannot be exported: {ast.unparse(node)}")
         return ()
-
-    def _augmented(self, node: ast.AugAssign, env: dict[str, Any]) -> Any:
-        old, value = self._value(node.target, env), self._value(node.value, env)
-        if isinstance(node.op, ast.BitOr):
-            return self.trace.symbol("|", old, value)
-        operations: dict[type, Any] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
-        return operations[type(node.op)](old, value)
 
     def _assign(self, target: ast.expr, value: Any, env: dict[str, Any]) -> None:
         if isinstance(target, ast.Name):

@@ -67,7 +67,7 @@ class Symbol:
         return self.trace.symbol("fabs", self)
 
     def __or__(self, other: Any) -> Any:
-        return self.trace.condition("||", self, other)
+        return self.trace.symbol("|", self, other) if type(other) is int else self.trace.condition("||", self, other)
 
     __ror__ = __or__
     __rsub__, __truediv__, __rtruediv__ = reflected("-"), binary("/"), reflected("/")

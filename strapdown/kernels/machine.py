@@ -63,15 +63,15 @@ def _is_kernel(value: object) -> bool:
     return isinstance(value, FunctionType) and (value.__module__ or "").startswith(PACKAGE)
 
 
-def _names(code: CodeType) -> tuple[str, ...]:
+def names_of(code: CodeType) -> tuple[str, ...]:
     """Return the global names in a function's code and in its generator expressions."""
-    inner = (_names(code_object) for code_object in code.co_consts if isinstance(code_object, CodeType))
+    inner = (names_of(code_object) for code_object in code.co_consts if isinstance(code_object, CodeType))
     return sum(inner, code.co_names)
 
 
 def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
     """Return the kernel functions that a function refers to, by name."""
-    named = {name: function.__globals__.get(name) for name in _names(function.__code__)}
+    named = {name: function.__globals__.get(name) for name in names_of(function.__code__)}
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
 
 
@@ -109,7 +109,7 @@ def _checked(
 ) -> dict[str, tuple[FunctionType, tuple[ModuleType, ...]]]:
     """Return definition and parts of each kernel that a function refers to, by name; invalid references are refused, recursively."""
     checked = {}
-    for name in _names(function.__code__):
+    for name in names_of(function.__code__):
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
             raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
@@ -133,7 +133,7 @@ def _bound_name(function: FunctionType, parts: tuple[ModuleType, ...]) -> str:
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
     bound: dict[str, Any] = {name: helper(*checked) for name, checked in _checked(function, parts).items()}
-    others = (name for name in _names(function.__code__) if name in function.__globals__ and name not in bound)
+    others = (name for name in names_of(function.__code__) if name in function.__globals__ and name not in bound)
     bound |= {"__name__": function.__module__, **{name: function.__globals__[name] for name in others}}
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
     twin.__qualname__ = _bound_name(function, parts)
