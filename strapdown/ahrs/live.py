@@ -131,7 +131,7 @@ class LiveAhrs:
         parameters, step = self.parameters, max(self.parameters.step, self.interval)
         constants = headings.constants_of(parameters, step)
         self._memory, self._rests = headings.memory_of(constants), starting.memory_of(self.interval, parameters)
-        self._found = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (36,))))
+        self._at_sample = Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (36,))))
         live, state, numbers, places = estimation_live.arrays_of(self._filter)
         time, gyro, force, field = (x.reshape(-1, 3) if len(x) > 1 else x for x in np.split(self._sample, [1, 4, 7]))
         imu = kernel.Imu(
@@ -194,9 +194,9 @@ class LiveAhrs:
         at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
         stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
         of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
-        heading = a.found_direction, a.found_sigma, a.found_usual, a.found_iron, a.found_variance
+        heading = a.heading_direction, a.heading_sigma, a.usual_field, a.subtracted_iron, a.heading_iron_variance
         samples = imu.time, imu.gyro, imu.accelerometer, imu.magnetic if self.magnetometer else imu.magnetic[:0]
-        at_rest = starting.kernel.Means(a.found_rate, a.found_rest, a.found_gained, a.found_bias)
+        at_rest = starting.kernel.Means(a.rate_at_rest, a.rate_at_rest_variance, a.bias_gained, a.bias_by_rests)
         return kernel.Routines(
             follow=(r(a.times), r(a.rates), a.turns),
             average=(r(a.force), r(a.frame), a.edge, a.total, a.number),
@@ -213,7 +213,7 @@ class LiveAhrs:
                 at_step,
                 stamps,
                 regions.limits(parameters, delay_sigma, magnetometer=self.magnetometer),
-                self._found,
+                self._at_sample,
             ),
             average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),
             head=(
@@ -352,22 +352,22 @@ class LiveAhrs:
     @property
     def attitude(self) -> Array:
         """Attitude q_fb (4,), scalar first; NaN before the first sample of the accelerometer."""
-        return np.array(self._found.attitude[1])
+        return np.array(self._at_sample.attitude[1])
 
     @property
     def bias(self) -> Array:
         """Gyro bias (3,), rad/s, body axes."""
-        return np.array(self._found.bias[1])
+        return np.array(self._at_sample.bias[1])
 
     @property
     def variance(self) -> Array:
         """Variances of the errors of attitude and bias (6,)."""
-        return np.array(self._found.variance[1])
+        return np.array(self._at_sample.variance[1])
 
     @property
     def covariance(self) -> Array:
         """Covariance of these errors (6, 6)."""
-        return np.array(self._found.covariance[1].reshape(6, 6))
+        return np.array(self._at_sample.covariance[1].reshape(6, 6))
 
 
 def arrays_of(

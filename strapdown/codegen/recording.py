@@ -26,7 +26,7 @@ from strapdown.kernels.rotation import unit
 
 MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
-LOCAL = ("found_direction", "found_sigma", "found_usual", "found_variance")
+LOCAL = ("heading_direction", "heading_sigma", "usual_field", "heading_iron_variance")
 """Arrays of :data:`strapdown.kernels.live_imu.PASSING` that a branch writes: those are local arrays of the target."""
 OF_FIELD = (
     *("field", "field_innovation", "field_density", "field_averages", "mean_square"),
@@ -304,7 +304,7 @@ def end_step(imu: Any) -> None:
         use_alignment(imu.filter)
     if imu.magnetometer > 0:
         for i in range(3):
-            imu.arrays.found_direction[0, i] = 0.0
+            imu.arrays.heading_direction[0, i] = 0.0
     live_imu.end_step(imu)
 
 

@@ -81,8 +81,8 @@ def analyse(
     Examples
     --------
     >>> import strapdown as sd
-    >>> found = sd.covariance_analysis("two-stars")  # doctest: +SKIP
-    >>> print(found)  # doctest: +SKIP
+    >>> analysis = sd.covariance_analysis("two-stars")  # doctest: +SKIP
+    >>> print(analysis)  # doctest: +SKIP
     """
     scenario = scenarios.as_scenario(scenario)
     setup = FilterSetup.for_scenario(scenario) if setup is None else setup

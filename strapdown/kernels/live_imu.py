@@ -100,15 +100,15 @@ PASSING = {
     "end": ((1, 4), "", "and at its end"),
     "now": ((1,), "wide", "time of its end, s"),
     "turn_variance": ((1, 3), "", "variance of the rotation over the step in addition to the gyro's noise, rad^2"),
-    "found_direction": ((1, 3), "", "heading measurement at the end of the step"),
-    "found_sigma": ((1,), "", "its sigma; 0: none"),
-    "found_usual": ((1, 2), "", "usual magnitude and dip of the field"),
-    "found_iron": ((1, 3), "", "iron subtracted"),
-    "found_variance": ((1,), "", "variance of the heading by constant iron"),
-    "found_rate": ((1, 3), "", "mean rate at rest"),
-    "found_rest": ((1,), "", "its variance"),
-    "found_gained": ((1,), "", "variance that the bias has gained"),
-    "found_bias": ((1, 3), "", "bias by all rests so far"),
+    "heading_direction": ((1, 3), "", "heading measurement at the end of the step"),
+    "heading_sigma": ((1,), "", "its sigma; 0: none"),
+    "usual_field": ((1, 2), "", "usual magnitude and dip of the field"),
+    "subtracted_iron": ((1, 3), "", "iron subtracted"),
+    "heading_iron_variance": ((1,), "", "variance of the heading by constant iron"),
+    "rate_at_rest": ((1, 3), "", "mean rate at rest"),
+    "rate_at_rest_variance": ((1,), "", "its variance"),
+    "bias_gained": ((1,), "", "variance that the bias has gained"),
+    "bias_by_rests": ((1, 3), "", "bias by all rests so far"),
 }
 """Arrays that are written anew for each sample or step."""
 Arrays: Any = NamedTuple("Arrays", [(name, np.ndarray) for name in (*LASTING, *PASSING)])  # type: ignore[misc]
@@ -362,10 +362,10 @@ def end_field(imu):
     for i in range(3):
         a.turn_variance[0, i] = a.over_gap[0]
     call(routines.head.address, routines.head.arguments, ())
-    if a.found_sigma[0] > 0.0:
-        update_filter(imu, 1, a.found_direction, a.found_sigma[0], a.field_innovation)
+    if a.heading_sigma[0] > 0.0:
+        update_filter(imu, 1, a.heading_direction, a.heading_sigma[0], a.field_innovation)
         call(routines.judge_field.address, routines.judge_field.arguments, ())
-    a.iron_variance[0] = a.found_variance[0]
+    a.iron_variance[0] = a.heading_iron_variance[0]
 
 
 def begin_step(imu):

@@ -240,9 +240,9 @@ def _roles(
         if named or any(role in roles for role in members):
             roles = named | roles
             continue
-        found_unit = _guess(source, group, columns)
-        if found_unit is not None:
-            places, unit = found_unit
+        guess = _guess(source, group, columns)
+        if guess is not None:
+            places, unit = guess
             roles |= dict(zip(members, places, strict=True))
             unit_by_role |= dict.fromkeys(members, unit) if unit else {}
             said = ", ".join(repr(columns[k].said) for k in places)
