@@ -263,13 +263,8 @@ def traced(twin: FunctionType, plain: Any, *, called: bool) -> Any:
 
     def define(typing: Any, *operands: Any, **named: Any) -> Any:
         operands = formula.signature.bind(*operands, **named).args
-        finding = Trace(typing)
-        try:
-            with finding.running():
-                result = type_of(formula(*map(symbols, operands)))
-        except NotAFormula:
-            kind, wanted = finding.signature(plain, operands)
-            return wanted, lambda target, builder, _, values: target.get_function(kind, wanted)(builder, values)
+        with Trace(typing).running():
+            result = type_of(formula(*map(symbols, operands)))
 
         def write(target: Any, builder: Any, signature: Any, values: Any) -> Any:
             writing = Trace(typing, target, builder)
