@@ -251,9 +251,7 @@ class Writer:
     def text(self, value: Any, kind: str = "") -> str:
         """Return a value where a number of a type is used."""
         if isinstance(value, Symbol):
-            if value in self.names:
-                return self.names[value]
-            return self._expression(value) if value.kind == "item" else f"({self._expression(value)})"
+            return self.names[value] if value in self.names else self._expression(value)  # an item has no name
         if kind == "int" and float(value).is_integer():
             return str(int(value))
         return repr(float(value)) if kind == "wide" else self.language.number(float(value))
