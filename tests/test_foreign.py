@@ -15,7 +15,7 @@ from ulog_writer import message as ulog_message
 
 import strapdown as sd
 from sims import peer_judged
-from strapdown import consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
+from strapdown import consistency, montecarlo, quaternion, recordings, records, report, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency import alignment, foreign
 from strapdown.estimation import setup
@@ -499,6 +499,42 @@ def test_the_errors_are_those_of_the_alignment_that_was_asked_for(align, heading
     else:
         assert sizes["all samples"]["heading"].rms == pytest.approx(heading * DEGREE, abs=0.5 * DEGREE)
     assert checked(replayed, attitude=attitude).accuracy.aligned["all samples"]["heading"].rms < 1e-6
+
+
+def test_errors_after_alignment_are_measured_by_their_covariance(tmp_path):
+    """Errors drawn from a known P, unequal over axes and time; frames and clock of the truth differ: 95 % in the region, RMS/σ 1."""
+    m, shift = 4000, 0.3
+    time, random = 0.05 * np.arange(m), np.random.default_rng(12)
+    factor = DEGREE * np.array([[0.5, 0.0, 0.0], [-0.3, 1.0, 0.0], [0.6, -0.8, 3.0]])
+    factor = factor * (1.0 + 0.5 * np.sin(0.1 * time))[:, None, None]
+    P = factor @ np.swapaxes(factor, 1, 2)
+    exact = quaternion.multiply(quaternion.multiply(F, FLIGHT.motion.attitude(time + shift)), B)
+    error = np.einsum("mij,mj->mi", factor, random.standard_normal((m, 3)))
+    attitude = quaternion.multiply(exact, quaternion.exp(-error))
+    stamps = np.arange(0.0, 201.0, 0.02)
+    truth, own = FLIGHT.motion.attitude(stamps), Attitudes.from_arrays(time, attitude, covariance=P)
+    estimate = records.Estimate.from_arrays(time, attitude, P)
+    stored = Truth(attitude=FLIGHT.motion.attitude(time))
+    of_fixed = Attitudes.from_arrays(time, attitude, covariance=carried(P, quaternion.to_matrix(attitude)))
+    sd.write(replace(estimate, truth=stored), tmp_path / "estimate.h5")
+    report.write(tmp_path / "estimate.h5")
+    page = json.loads((tmp_path / "estimate.report.json").read_text())["accuracy"]
+    tables = [
+        consistency.check_attitudes(own, Attitudes.from_arrays(stamps, truth), error_frame="body").accuracy.summary(),
+        consistency.check_attitudes(
+            of_fixed, Attitudes.from_arrays(stamps, truth), error_frame="fixed"
+        ).accuracy.summary(),
+        sd.accuracy(estimate, Attitudes.from_arrays(stamps, truth)).summary(),
+        sd.accuracy(estimate, stored).summary(),
+        page,
+    ]
+    for table in tables:
+        for part, degrees in (("total", 3), ("heading", 1), ("inclination", 2)):
+            size = table["aligned"]["all samples"][part]
+            assert size["coverage"] == pytest.approx(0.95, abs=3.5 * np.sqrt(0.95 * 0.05 / m))
+            assert size["rms_over_sigma"] == pytest.approx(1.0, abs=3.5 * np.sqrt(0.5 / (degrees * m)))
+    shown = sd.accuracy(estimate, stored).listing()
+    assert {row[1] for row in shown.rows if row[6]} == {"as given", "aligned"}
 
 
 def test_large_rotations_of_both_frames_are_found_in_the_slowest_motion():

@@ -154,7 +154,8 @@ class Accuracy(Listed):
                     ratio = "" if math.isnan(size.rms_over_sigma) else size.rms_over_sigma
                     rows.append((span, words, kind, *angles, share, ratio))
         notes = [
-            "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter."
+            "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter"
+            + ("; aligned, less if its errors are partly constant." if self.aligned else ".")
         ]
         if self.bias is not None:
             error, sigma = (figure(value / DEGREE_PER_HOUR) for value in self.bias)
@@ -223,7 +224,7 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     P = estimate.attitude_covariance
     own = Series(estimate.time, estimate.attitude, P if P is not None and np.isfinite(P).all() else None)
     theirs = truth.taken(known)
-    as_stored = _sizes(own.attitude[known], theirs, None if own.covariance is None else own.covariance[known])
+    as_stored = _sizes(own.at(known, own.time[known], own.attitude[known]), theirs)
     alignment, aligned, bias = None, dict[str, dict[str, ErrorSize]](), None
     if align:
         truth_at = Series(own.time[known], theirs.attitude, movement=theirs.movement)
@@ -245,9 +246,7 @@ def accuracy_of(own: Series, theirs: Series, alignment: Alignment | None = None)
     aligned = _aligned_sizes(own, theirs, alignment) if alignment.estimated else {}
     as_stored: dict[str, dict[str, ErrorSize]] = {}
     with contextlib.suppress(InputError):
-        matched, truth = at_common_times(own, theirs, 0.0)
-        P = None if matched.covariance is None else matched.covariance[:, :3, :3]
-        as_stored = _sizes(matched.attitude, truth, P)
+        as_stored = _sizes(*at_common_times(own, theirs, 0.0))
     return Accuracy(given=as_stored, aligned=aligned, alignment=alignment)
 
 
@@ -259,14 +258,17 @@ def _whole_alignment(own: Series, theirs: Series) -> Alignment:
 
 def _aligned_sizes(own: Series, theirs: Series, alignment: Alignment) -> dict[str, dict[str, ErrorSize]]:
     """Return the errors after an alignment, about the vertical of the estimate."""
-    matched, truth = at_common_times(own, theirs, alignment.offset)
-    return _sizes(*in_common_frames(matched.attitude, truth, *alignment.turns), None)
+    return _sizes(*at_common_times(own, theirs, alignment.offset), *alignment.turns)
 
 
-def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:
-    """Return the sizes of the errors by span and part; P (m, 3, 3) is the covariance of the body-side error."""
+def _sizes(own: Series, truth: Truth, *turns: Array) -> dict[str, dict[str, ErrorSize]]:
+    """Return the sizes of the errors by span and part, after the rotations ``turns`` of fixed and body frames, if any, are removed."""
+    attitude, truth = in_common_frames(own.attitude, truth, *turns) if turns else (own.attitude, truth)
     errors = reference_errors(attitude, truth.attitude)
-    squares = None if P is None else _normalised(attitude, truth.attitude, P)
+    squares = None
+    if own.covariance is not None:
+        R = quaternion.to_matrix(own.attitude)  # to the fixed frame, in which another body frame changes nothing
+        squares = _normalised(attitude, truth.attitude, R @ own.covariance[:, :3, :3] @ np.swapaxes(R, 1, 2))
     spans = {"all samples": np.ones(len(attitude), bool)}
     if truth.movement is not None and truth.movement.any():
         spans["movement"] = truth.movement
@@ -290,9 +292,7 @@ def _size(kind: str, angle: Array, squares: Array | None) -> ErrorSize:
     return size._replace(coverage=inside, rms_over_sigma=float(np.sqrt(np.mean(squares) / degrees)))
 
 
-def _normalised(attitude: Array, true_attitude: Array, P: Array) -> dict[str, Array]:
-    """Return the normalised squares (m,) of each part of the error, in the fixed frame, whose z axis is vertical."""
-    R = quaternion.to_matrix(attitude)
-    C = R @ P @ np.swapaxes(R, 1, 2)
+def _normalised(attitude: Array, true_attitude: Array, covariance: Array) -> dict[str, Array]:
+    """Return the normalised squares (m,) of each part of the error; axes and covariance are those of the fixed frame, z vertical."""
     error = quaternion.log(quaternion.multiply(true_attitude, quaternion.conjugate(attitude)))
-    return {kind: nees(error, C, states) for kind, states in _STATES.items()}
+    return {kind: nees(error, covariance, states) for kind, states in _STATES.items()}
