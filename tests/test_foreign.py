@@ -428,7 +428,9 @@ def test_frames_and_clock_are_found_and_removed(replayed):
         assert np.all(a.sigma[rows] < 0.5 * DEGREE)
     assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
     assert outcome.judgement.verdict != "not consistent"
-    assert len([words for words in outcome.estimate.remarks if "removed" in words]) == 3
+    removed = [words for words in outcome.estimate.remarks if "removed" in words]
+    assert [words.startswith("Note: for the verdict, ") for words in removed] == 3 * [True]
+    assert sum("Aligned rows: " in words and "removed" in words for words in outcome.accuracy.listing().notes) == 3
     # In the truth's body axes again, but for the uncertainty of what was removed, which is part of the covariance.
     rows = np.searchsorted(e.time, outcome.estimate.time - 0.05)
     np.testing.assert_allclose(outcome.estimate.bias, e.bias[rows], atol=0.03 * np.abs(e.bias).max())

@@ -161,7 +161,7 @@ class Accuracy(Listed):
             error, sigma = (figure(value / DEGREE_PER_HOUR) for value in self.bias)
             notes.append(f"Gyro bias: RMS error {error} °/h, σ {sigma} °/h, of three axes together.")
         if self.alignment is not None:
-            notes += [f"Aligned: {words}." for words in self.alignment.words]
+            notes += [f"Aligned rows: {words}." for words in self.alignment.words]
         columns = (
             "over",
             "frames",

@@ -192,7 +192,8 @@ def check_attitudes(
     wanted = _wanted(align)
     whole, alignment = align_series(whole, theirs, wanted, remarks)
     common, true = at_common_times(whole, theirs, alignment.offset)
-    remarks += [*_words_on_few_times(len(common.time), whole, theirs), *alignment.words]
+    remarks += [*_words_on_few_times(len(common.time), whole, theirs)]
+    remarks += [f"for the verdict, {words}" for words in alignment.words]
     aligned, true = in_common_frames(common.attitude, true, *alignment.turns)
     reading = _Reading("", {})
     if whole.covariance is not None:
