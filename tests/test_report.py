@@ -5,6 +5,7 @@ import dataclasses
 import html.parser
 import json
 import re
+import shutil
 import sys
 import zlib
 from pathlib import Path
@@ -284,6 +285,19 @@ def test_two_estimates_on_one_page(folder, tmp_path):
     setup.write_estimate(tmp_path / "later.h5", later)
     with pytest.raises(InputError, match="give estimates of the same time"):
         report.write(folder / "right.h5", tmp_path / "page.html", other=tmp_path / "later.h5")
+
+
+def test_a_page_of_two_estimates_has_a_name_of_both(folder, tmp_path):
+    """It does not replace that of the first alone; estimates of the same name are told apart by their folders."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        shutil.copy(folder / "right.h5", tmp_path / name / "estimate.h5")
+    shutil.copy(folder / "wrong.h5", tmp_path / "a" / "poor.h5")
+    for other in (None, tmp_path / "a" / "poor.h5", tmp_path / "b" / "estimate.h5"):
+        report.write(tmp_path / "a" / "estimate.h5", other=other)
+    pages = {path.name for path in tmp_path.rglob("*.html")}
+    assert pages == {"estimate.html", "estimate-and-poor.html", "estimate-and-b.html"}
+    assert {path.name for path in tmp_path.rglob("*.json")} == {page.replace("html", "report.json") for page in pages}
 
 
 def test_a_second_estimate_is_interpolated_by_rotation_at_constant_rate():

@@ -56,7 +56,7 @@ def write(
     result : path
         HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning or of a coning study.
     out : path, optional
-        The page. Default: ``result`` with the suffix .html.
+        The page. Default: ``result`` with the suffix .html; with ``other`` beside it as ``RESULT-and-OTHER.html``.
     other : path, optional
         A second estimate of the same motion: the page has both, and their difference.
 
@@ -67,7 +67,11 @@ def write(
     """
     source = Path(result)
     existing_file(source)
-    target = source.with_suffix(".html") if out is None else Path(out)
+    name = source.stem
+    if other is not None:  # named by its folder if both files have the same name
+        second = Path(other).resolve()
+        name += f"-and-{second.stem if second.stem != name else second.parent.name}"
+    target = source.with_name(f"{name}.html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"out is {target}; give a file with the suffix .html")
     beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
