@@ -16,7 +16,7 @@ from strapdown import consistency, montecarlo
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import Gate, ProcessNoise
-from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup import FilterSetup, write_estimate
 from strapdown.gyro import GyroSpec
 from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
 
@@ -361,4 +361,10 @@ def test_check_refuses_what_it_cannot_judge(run, refusal, tmp_path):
     assert wrong == "error: absent.h5 does not exist; check the path\n"
     (tmp_path / "text.h5").write_text("no HDF5")
     assert "cannot be read as HDF5" in run("check", "text.h5")[2]
+    (tmp_path / "unit.csv").write_text("time,gx\n0,1\n")
+    write_estimate(tmp_path / "estimate.h5", estimate()[0])
+    for command in (("report", "unit.csv"), ("check", "estimate.h5", "--record", "unit.csv")):
+        assert (
+            "a recording (for `strapdown estimate`) or a table of attitudes (for `strapdown check`)" in run(*command)[2]
+        )
     assert "--filter goes with --record" in run("check", "text.h5", "--filter", "f.toml")[2]

@@ -221,7 +221,10 @@ def hdf5(path: Name) -> Iterator[Any]:
     with from_file(path):
         sealed = has_digest(path)
         if not is_hdf5(path):
-            raise InputError(f"{path} cannot be read as HDF5 (no signature); it is truncated or of another kind")
+            raise InputError(
+                f"{path} cannot be read as HDF5 (no signature), the format of records and results; it is truncated or of another kind, as "
+                "a recording (for `strapdown estimate`) or a table of attitudes (for `strapdown check`)"
+            )
         with uninterrupted(), h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
                 raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")
