@@ -175,10 +175,6 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
     parts["sensors"] = [_read_sensor(*entry) for entry in _entries(table.get("sensors", []), "sensors", place)]
     own = {key: value for key, value in table.items() if key not in _PARTS}
     scenario: Scenario = tables.build(Scenario, own, TOP_FORM, place, **parts)
-    if scenario.duration * scenario.rate < 1.0:
-        raise InputError(
-            f"{place}: {scenario.duration:g} s at {scenario.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
-        )
     for sensor in scenario.sensors:
         number = scenario.duration * getattr(sensor, "rate", 0.0)
         if number > MAX_MEASUREMENTS:
