@@ -16,7 +16,7 @@ from strapdown.ahrs import check_conventions
 from strapdown.ahrs.check_conventions import AXES, FRAMES
 from strapdown.checks import Hint, InputError
 from strapdown.cli.terminal import option
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, sensor_delays
 from strapdown.units import STANDARD_GRAVITY
 
 EAST_NORTH_UP_FIELD = np.array([0.0, 18e-6, -45e-6])
@@ -285,7 +285,10 @@ def test_all_axes_are_signed_permutations_the_identity_first():
     assert check_conventions.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
 
 
-@pytest.mark.parametrize(("behind", "start"), [(0.0, "No delay"), (0.011, "The mag"), (-0.2, "The mag")])
+@pytest.mark.parametrize(
+    ("behind", "start"),
+    [(0.0, "The magnetometer shows no"), (0.011, "The magnetometer's"), (-0.2, "The magnetometer's")],
+)
 def test_the_delay_of_the_magnetometer_is_noted_as_the_smoother_compensates_it(behind, start):
     recording = late(field=behind)
     note = check_conventions.examine(recording).notes[-1]
@@ -387,3 +390,8 @@ def test_the_misfit_of_unrelated_directions_is_one():
     misfits = check_conventions._fixed_misfits(vectors, dict.fromkeys(vectors, np.ones(5000, int)))
     assert misfits["gyro and magnetometer"] == pytest.approx(0.0, abs=1e-12)
     assert misfits["accelerometer and magnetometer"] == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_large_sigma_of_the_delay_is_printed_without_exponent():
+    delays = sensor_delays.Delays(gyro=0.005, sigma=0.002, field=0.0, field_sigma=0.0743, is_specified=False)
+    assert "σ 74 ms" in delays.field_words

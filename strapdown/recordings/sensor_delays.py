@@ -14,6 +14,7 @@ from strapdown.checks import Array, Hint, InputError, median, non_negative
 from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording, sampled
+from strapdown.results import figure
 
 FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
@@ -68,13 +69,13 @@ class Delays:
     @property
     def field_words(self) -> str:
         """Description of the magnetometer's delay, and what :func:`strapdown.estimate` does with it; empty if it is not observable."""
-        field, sigma = 1e3 * self.last_field, f"σ {1e3 * self.field_sigma:.1g} ms"
+        field, sigma = 1e3 * self.last_field, f"σ {figure(1e3 * self.field_sigma, 1)} ms"
         if field:
             side = "after" if field > 0.0 else "before"
             return f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, {sigma}, compensated in the estimate"
         if self.field_sigma == np.inf:
             return ""
-        return f"No delay of the magnetometer beside the gyro shows, {sigma}: none is compensated in the estimate"
+        return f"The magnetometer shows no delay relative to the gyro, {sigma}: none is compensated in the estimate"
 
     @property
     def last_field(self) -> float:
