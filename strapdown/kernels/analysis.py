@@ -1,4 +1,4 @@
-"""Covariance analysis: contributions of error sources to the error of a filter. A body of :mod:`strapdown.kernels.walk`.
+"""Covariance analysis: contributions of error sources to the error of a filter; run by :mod:`strapdown.kernels.walk`.
 
 The filter of :mod:`strapdown.kernels.filter` runs along the true trajectory, with measurements without noise: its state remains the truth,
 and its covariance gives the gains. The actual error e, linearised there, is propagated by the same transitions and gains, source by source:

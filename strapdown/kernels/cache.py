@@ -34,7 +34,7 @@ class CacheWarning(UserWarning):
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """The entries of one kernel, whose ``name`` includes the bodies it is bound to; ``sources``: digest of all that it is compiled from."""
+    """The entries of one kernel, whose ``name`` includes the modules bound to it; ``sources``: digest of all that it is compiled from."""
 
     _warned = False
 

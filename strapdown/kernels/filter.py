@@ -1,4 +1,4 @@
-"""The multiplicative EKF of N error states: a body of :mod:`strapdown.kernels.walk`.
+"""The multiplicative EKF of N error states, run by :mod:`strapdown.kernels.walk`.
 
 - ``layout``: arrays of state, covariance and work space, for one run or several in lanes;
 - ``model``: Φ, Q and the prediction;

@@ -1,4 +1,4 @@
-"""A gate and robust weights around the filter of :mod:`strapdown.kernels.filter`: a body of :mod:`strapdown.kernels.walk`.
+"""A gate and robust weights around the filter of :mod:`strapdown.kernels.filter`; run by :mod:`strapdown.kernels.walk`.
 
 Updates are in :mod:`strapdown.kernels.gated_update`, the consequences of refusals in :mod:`strapdown.kernels.gate_rules`. Row 0 of the
 states is the filter, row 1 the restart candidate (:mod:`strapdown.kernels.restart_candidate`), if there is one; both are processed by the
@@ -88,7 +88,7 @@ class Outputs(NamedTuple):
     """(rows, 5): kind, sensor, start, end and number of refusals of each recovery and lock-out, except lock-outs in the counters."""
 
 
-# ------------------------------------------------------------------------------------------------------------------ the body of the walk
+# ----------------------------------------------------------------------------------------------------------- the functions for the walk
 
 
 def increment_over(increments, k, body):

@@ -1,4 +1,4 @@
-"""The filter for eight sets of parameters together, one per lane, and the sensitivities of its innovations: a body of the walk.
+"""The filter for eight sets of parameters together, one per lane, and the sensitivities of its innovations; run by the walk.
 
 The filter is an instance of :mod:`strapdown.kernels.filter` with ``PARAMETERS``: gyro noise, σ of each sensor, error states and initial
 covariance differ between lanes. If lane i is lane 0 with a small change of parameter i, differences between lanes are the derivatives of

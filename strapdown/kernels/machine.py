@@ -121,9 +121,9 @@ def _checked(
 
 
 def _bound_name(function: FunctionType, parts: tuple[ModuleType, ...]) -> str:
-    """Return the qualified name of a function, with a digest of the bodies that it is bound to.
+    """Return the qualified name of a function, with a digest of the modules that it is bound to.
 
-    numba names symbols by the qualified name and a number that begins anew in each process: two bodies of a function, from the caches of
+    numba names symbols by the qualified name and a number that begins anew in each process: two versions of a function, from the caches of
     two processes, would have one name, and an address would be that of either.
     """
     digest = hashlib.sha256(" ".join(module.__name__ for module in parts).encode()).hexdigest()

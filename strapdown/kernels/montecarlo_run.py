@@ -1,4 +1,4 @@
-"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of eight runs at once along one motion, a body of the walk.
+"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of eight runs at once along one motion; run by the walk.
 
 Truth, times and all else common to the runs are plain arrays; values that differ between runs are lanes. Each run has its own random
 streams (:func:`strapdown.kernels.noise.stream_state`, with one key per source and the run's number), so it does not depend on its

@@ -1,4 +1,4 @@
-"""The multiplicative EKF of attitude and gyro bias in registers: a body of :mod:`strapdown.kernels.walk` without a gate.
+"""The multiplicative EKF of attitude and gyro bias in registers, without a gate; run by :mod:`strapdown.kernels.walk`.
 
 The formulas are those of :mod:`strapdown.kernels.filter_step`; the same filter for any number of states is :mod:`strapdown.kernels.filter`.
 """

@@ -153,10 +153,8 @@ def add_step(x, step, work, like):
 def rotate_covariance(P, work, gain, G, A, like):
     """Subtract Σ g gᵀ from P, and transform the attitude by G and the carried vectors by A."""
     groups = ((AXES, G), *((v, A) for v in STRUCTURE.vectors))
-    half, whole = (
-        {},
-        {},
-    )  # rows that rotate, transformed from the left; their elements of columns that rotate, from both sides
+    half = {}  # rows that rotate, transformed from the left
+    whole = {}  # their elements of columns that rotate, from both sides
     for m, (v, T) in enumerate(groups):
         for first in CHUNKS if LANES == 1 else STATES:
             if first in PLAIN or LANES == 1 or any(first in w for w, _ in groups[m:]):

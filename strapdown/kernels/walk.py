@@ -1,7 +1,7 @@
 """The loop of every filter over a record: one gyro interval after the other, split at the times of measurements.
 
-A filter is a module that defines the functions left open here (a *body*); :func:`strapdown.kernels.machine.compiled` binds them. Its
-state is the value that ``begin`` returns; further data (noise, options, work arrays) are in ``body``, a NamedTuple of the filter.
+A filter is a module that defines the functions left open here; :func:`strapdown.kernels.machine.compiled` binds them. The state of the
+loop is the value that ``begin`` returns; the filter's own data (state, noise, options, work arrays) are in a NamedTuple, ``body``.
 """
 
 from __future__ import annotations
