@@ -904,8 +904,8 @@ def test_an_alignment_is_described_with_its_sigma():
     assert clock.startswith("clocks differ by 1.5 s ± 0.25 s")
     epoch = replace(described, offset=1_700_000_000.1234)
     assert epoch.words[0].startswith("clocks differ by 1700000000.12 s ± 0.25 s")
-    assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° an axis")
-    assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° an axis")
+    assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° per axis")
+    assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° per axis")
     *numbers, residual = [value for key, value in described.summary().items() if key != "removed"]
     np.testing.assert_allclose(np.hstack(numbers), [1.5, 0, 3, 4, 6, 0, 0, 2, 2, 2, 5, 5, 5, 0.25], rtol=1e-12)
     assert residual == pytest.approx(7.0)

@@ -95,7 +95,7 @@ class Alignment:
                 text = ", ".join(f"{x / DEGREE:.4g}" for x in rotation)
                 sigma = float(np.sqrt(np.mean(self.sigma[rows] ** 2))) / DEGREE
                 words.append(
-                    f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
+                    f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° per "
                     f"axis{_usual(name, rotation)}: removed; a constant error of the filter would look the same"
                 )
         if abs(quaternion.to_matrix(self.turns[0])[2, 2]) < math.cos(GROSS):

@@ -1,6 +1,6 @@
 """The filter of attitude and bias in a Monte Carlo, by :mod:`strapdown.kernels.filter_step`: its state stays in registers.
 
-Only for measurements whose noise is isotropic, or of an attitude one variance an axis.
+Only for measurements whose noise is isotropic, or of an attitude one variance per axis.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def predict(state, part, dt, body, out):
 
 
 def update(state, e, now, measured, body, out):
-    """Update with a measurement whose noise is isotropic, or of an attitude one variance an axis."""
+    """Update with a measurement whose noise is isotropic, or of an attitude one variance per axis."""
     q, b, A, B, C, segments, lost = state
     R = rotation_matrix(q)
     at = measured.place[e]

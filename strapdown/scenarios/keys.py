@@ -147,11 +147,11 @@ def _motions() -> list[Section]:
 
 def _gyro() -> Section:
     names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
-    meaning = f"A gyro on the market, of which other keys change what they name. One of {names}."
+    meaning = f"A gyro on the market, whose values other keys replace. One of {names}."
     example = next(iter(datasheets.PRESETS))
     preset = Key(name="preset", type="text", default="none", meaning=meaning, example=example)
     own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
-    return Section(group="gyro", header="[gyro]", summary="the gyro; what is left out is perfect.", keys=(preset, *own))
+    return Section(group="gyro", header="[gyro]", summary="the gyro; errors left out are zero.", keys=(preset, *own))
 
 
 def _warm_gyro() -> Section:
@@ -209,7 +209,7 @@ def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meanin
     )
 
 
-_TYPES = {str: "text", int: "whole number", float: "number", gyro.Axes: "number, or one an axis"}
+_TYPES = {str: "text", int: "whole number", float: "number", gyro.Axes: "number, or one per axis"}
 
 
 def _type(hint: Any, default: Any) -> str:
