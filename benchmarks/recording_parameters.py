@@ -57,7 +57,7 @@ PARTS: dict[str, dict[str, float] | tuple[Any, dict[str, Any]]] = {
     "drift of the gyro's bias": {"rate_random_walk": 0.0},
     "hard iron": {"hard_iron_sigma": 0.0},
     "deviation of the field": {"field_deviation": 1e3},
-    "gaps filled by interpolation": (sensor_faults, {"interpolated": lambda *_: []}),
+    "recognition of interpolated gaps": (sensor_faults, {"interpolated": lambda *_: []}),
 }
 """What is left out of the model: parameters, or names of a module, with other values."""
 
