@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["ByValue", "Column", "Listed", "Table", "default_of", "equal", "figure", "not_default"]
+__all__ = ["ByValue", "Column", "Listed", "Table", "counted", "default_of", "equal", "figure", "not_default"]
 
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
@@ -207,6 +207,11 @@ def figure(value: float | None, digits: int = 4) -> str:
         return "∞" if value > 0.0 else "-∞"
     number = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+" in number and abs(value) < 1e6 else number
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things in words, such as ``"1 run"`` and ``"20 runs"``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 class ByValue:

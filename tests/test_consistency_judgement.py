@@ -18,6 +18,7 @@ from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import Gate, ProcessNoise
 from strapdown.estimation.setup import FilterSetup, write_estimate
 from strapdown.gyro import GyroSpec
+from strapdown.montecarlo import verdicts
 from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
 
 
@@ -311,7 +312,9 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all():
 
 
 def test_few_runs_cannot_tell():
-    assert "not testable from 1 run:" in statistics_of(runs=1).judge().reason
+    single = statistics_of(runs=1)
+    assert "not testable from 1 run:" in single.judge().reason
+    assert [t.title for t in verdicts.tables(verdicts.summary(single)) if "1 runs" in t.title] == []
     few = statistics_of(runs=2)
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
     assert starved.judge().verdict == "cannot tell"

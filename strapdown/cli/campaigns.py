@@ -14,6 +14,7 @@ from strapdown.checks import InputError, count
 from strapdown.cli import terminal as ui
 from strapdown.cli.options import GYRO, SCENARIO, STATES, options_given
 from strapdown.files import HDF5, write_json
+from strapdown.results import counted
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Plan
@@ -136,7 +137,7 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
         runs = campaigns.read(target).runs if options.resume and target.exists() else 1000
     choice = sd.montecarlo.choose(plan, options.machine)
     count("runs", runs)
-    ui.say(f"{plan.scenario.name or name}: {runs} run{'' if runs == 1 else 's'}, seed {plan.seed}, machine: {choice}.")
+    ui.say(f"{plan.scenario.name or name}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         workers = None
         if options.workers is not None or options.cluster is not None:

@@ -37,7 +37,7 @@ from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import ARRAYS, Statistics, lengths_of, merge
 from strapdown.records import put
 from strapdown.records.result_files import result_file
-from strapdown.results import Listed, Table
+from strapdown.results import Listed, Table, counted
 
 __all__ = ["Campaign", "read", "run"]
 
@@ -85,7 +85,7 @@ class Campaign(Listed):
     def listing(self) -> Table:
         """Return the statistics of the finished runs as a table."""
         if self.statistics is None:
-            return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
+            return Table(f"Monte Carlo of {counted(self.runs, 'run')}, none finished", (), ())
         return self.statistics.listing()
 
     def summary(self, judgement: Judgement | None = None) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class Campaign(Listed):
     def extent(self) -> str:
         """Numbers of runs, seed and machine, in words."""
         done = self.finished_runs
-        number = f"{done} run{'' if done == 1 else 's'}" if self.finished else f"{done} of {self.runs} runs"
+        number = counted(done, "run") if self.finished else f"{done} of {counted(self.runs, 'run')}"
         return f"{number} of {self.plan.scenario.duration:g} s, seed {self.plan.seed}, machine {self.machine}"
 
     @property

@@ -25,7 +25,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import engine
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.motion import Coning
-from strapdown.results import Column, Table
+from strapdown.results import Column, Table, counted
 from strapdown.scenarios import Scenario
 from strapdown.units import (
     ARCSECOND,
@@ -282,7 +282,7 @@ def words(summary: Mapping[str, Any]) -> str:
     p = summary["scenario"]
     return (
         f"Coning of {p['angle_deg']:g}° at {p['frequency_hz']:g} Hz, gyro sampled at {p['rate_hz']:g} Hz ({p['samples_per_cycle']:.3g} "
-        f"samples per cycle); {p['runs']} run{'' if p['runs'] == 1 else 's'} of {p['duration_s']:g} s, seed {p['seed']}"
+        f"samples per cycle); {counted(p['runs'], 'run')} of {p['duration_s']:g} s, seed {p['seed']}"
     )
 
 

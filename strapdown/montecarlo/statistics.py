@@ -29,7 +29,7 @@ from strapdown.consistency.judgement import (
 )
 from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord, Truth
-from strapdown.results import ByValue, Listed, Table, figure
+from strapdown.results import ByValue, Listed, Table, counted, figure
 
 Counts = NDArray[np.int64]
 
@@ -235,7 +235,7 @@ class Statistics(ByValue, Listed):
             parts=dict.fromkeys(parts, ""),
             required=detectable_error,
             unmodelled=() if self.plan is None else self.plan.unmodelled,
-            runs=f"{self.runs} run{'s' if self.runs > 1 else ''}",
+            runs=counted(self.runs, "run"),
         )
         if not (what := _odd_runs(self)):
             return judged
@@ -260,7 +260,7 @@ class Statistics(ByValue, Listed):
             )
         ]
         if self.failed:
-            notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
+            notes.append(f"{counted(self.failed, 'run')} failed: their errors or covariances are not finite")
         return replace(evidence, notes=(*evidence.notes, *notes))
 
     @property
@@ -482,7 +482,7 @@ def _anees(statistics: Statistics, epochs: Counts, subset: str, confidence_level
         at=f"mean {figure(float(verdict.mean.mean()))}, worst at {statistics.time[epochs[worst]]:g} s",
         means=error_words(f"the {subset} error at its worst epoch", value)
         if failed == 0
-        else f"{failed} of {statistics.runs} runs failed: the NEES of their {subset} is not finite",
+        else f"{failed} of {counted(statistics.runs, 'run')} failed: the NEES of their {subset} is not finite",
     )
 
 

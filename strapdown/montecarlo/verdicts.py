@@ -16,7 +16,7 @@ from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
 from strapdown.montecarlo.statistics import Statistics
-from strapdown.results import Column, Table
+from strapdown.results import Column, Table, counted
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors in the summary."""
@@ -117,7 +117,7 @@ def _errors(summary: Mapping[str, Any]) -> Table:
             f"RMS error divided by the root of the Cramér–Rao bound, by axis: {axes} (at one epoch {low:.3f} to {high:.3f} for an "
             "efficient filter)."
         )
-    title = f"Errors at {last['time_s']:g} s, {summary['runs']} runs; quantiles of the absolute error"
+    title = f"Errors at {last['time_s']:g} s, {counted(summary['runs'], 'run')}; quantiles of the absolute error"
     columns = (Column("", "state"), Column("unit", "unit"), *map(Column, labels, sizes))
     return Table(title, columns, rows, notes, left=2, name="errors")
 
@@ -134,9 +134,10 @@ def _coverage(summary: Mapping[str, Any]) -> Table:
     if refused := ", ".join(f"{number} of {sensor}" for sensor, number in summary["refused"].items() if number):
         notes.append(f"The gate rejected {refused}.")
     if failed := summary["failed_runs"]:
-        notes.append(f"In {failed} run{'s' if failed > 1 else ''} the filter failed: no finite error or covariance.")
+        notes.append(f"In {counted(failed, 'run')} the filter failed: no finite error or covariance.")
     columns = (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3)))
-    title = f"Fraction of the errors within kσ at the {summary['epochs_judged']} tested epochs, {summary['runs']} runs"
+    epochs, runs = counted(summary["epochs_judged"], "tested epoch"), counted(summary["runs"], "run")
+    title = f"Fraction of the errors within kσ at the {epochs}, {runs}"
     return Table(title, columns, rows, notes, name="coverage")
 
 

@@ -18,7 +18,7 @@ from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.style import settled
 from strapdown.report import page
-from strapdown.results import Table
+from strapdown.results import Table, counted
 from strapdown.units import angle_unit, rate_unit
 
 
@@ -37,7 +37,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
     shown = {k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}
     content = page.page(
         f"Monte Carlo: {name}",
-        f"{held.extent}, {len(statistics.time) - 1} epochs; strapdown {held.identity.version}",
+        f"{held.extent}, {counted(len(statistics.time) - 1, 'epoch')}; strapdown {held.identity.version}",
         page.judged(judgement),
         page.section("Evidence", page.table(judgement.listing())),
         page.section("Key numbers", *parts),
@@ -122,7 +122,7 @@ def _end(statistics: Statistics) -> list[str]:
         covered = 100.0 * statistics.covered[-1, : len(names), k]
         shares.append(page.Series(label=words, value=covered, colour=page.COLOURS[k]))
     title = "σ-coverage by state, with the bounds of a consistent filter"
-    charts = [page.chart(title, f"fraction of {runs} runs, %", places, shares, x="state", ticks=names)]
+    charts = [page.chart(title, f"fraction of {counted(runs, 'run')}, %", places, shares, x="state", ticks=names)]
     claimed, actual = statistics.covariance[-1], statistics.mean_square_error[-1]
     # The bias axis with the largest ratio between actual and filter variance, with the attitude about it.
     ratio = np.diag(actual)[3:] / np.diag(claimed)[3:]

@@ -12,7 +12,7 @@ from strapdown.consistency.judgement import VERDICTS
 from strapdown.files import reading
 from strapdown.plots.tuning import TALLEST, interval, measure_of
 from strapdown.report import page
-from strapdown.results import Table
+from strapdown.results import Table, counted
 
 
 def report(path: Path) -> tuple[str, dict[str, Any]]:
@@ -32,8 +32,7 @@ def report(path: Path) -> tuple[str, dict[str, Any]]:
         page.paragraph("To use it with a record; the estimate of a recording takes no filter:"),
         page.code(f'estimate = sd.estimate(record, setup=sd.estimation.setup.read_setup("{toml.name}"))'),
     ]
-    number = len(content["records"])
-    subtitle = f"{number} record{'' if number == 1 else 's'}"
+    subtitle = counted(len(content["records"]), "record")
     html = page.page(f"Tuning: {path.name}", subtitle, *parts, page.section("Provenance", *making))
     return html, {
         "source": path.name,
