@@ -38,7 +38,7 @@ SPEC = gyro.GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias
 
 
 def free(*names, of=ONE, filter_setup=BELIEVED):
-    return tuning.likelihood([of], filter_setup, names)
+    return tuning.likelihood([of], setup=filter_setup, free=names)
 
 
 def of_compass(*names, filter_setup=MATCHED):

@@ -68,13 +68,13 @@ class ErrorObjective(Objective):
 
 
 def error_objective(
-    cases: Sequence[Case], filter_setup: FilterSetup, free: Sequence[str], *, threads: int = 1
+    cases: Sequence[Case], setup: FilterSetup, free: Sequence[str], *, threads: int = 1
 ) -> ErrorObjective:
     """Return the objective that judges the filter by its errors on records with a truth, or with a reference attitude (attitude only).
 
     The likelihood of the errors under the filter's covariance requires small errors.
     """
-    base = likelihood(cases, filter_setup, free, threads=threads)
+    base = likelihood(cases, setup, free, threads=threads)
     references = tuple(_reference(base, number) for number in range(len(base.cases)))
     if len({known.bias is None for known in references}) > 1:
         raise InputError(

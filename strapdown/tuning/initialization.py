@@ -9,7 +9,7 @@ import numpy as np
 from strapdown import ahrs, estimation
 from strapdown.ahrs import AhrsParameters
 from strapdown.checks import InputError
-from strapdown.estimation import setup
+from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
@@ -72,14 +72,14 @@ def by_innovations(
     return (SCALE,) if names is None else names, spacing or INDEPENDENT
 
 
-def record_case(record: ImuRecord, filter_setup: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
+def record_case(record: ImuRecord, setup: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
     """Return a record with the filter's initial state.
 
     Parameters
     ----------
     record : ImuRecord
         Gyro increments and measurements.
-    filter_setup : FilterSetup
+    setup : FilterSetup
         Filter; defines the σ of the initial errors.
     name : str, optional
         Name of the record in messages and reports.
@@ -99,12 +99,12 @@ def record_case(record: ImuRecord, filter_setup: FilterSetup, *, name: str = "",
         If the first measurements do not determine the attitude.
     """
     if seed is not None and record.truth is not None:
-        return Case(record=record, initial=setup.drawn_state(filter_setup, record, seed), name=name)
+        return Case(record=record, initial=setups.drawn_state(setup, record, seed), name=name)
     try:
-        first = estimation.first_state(record, filter_setup.process_noise, bias_sigma=filter_setup.bias_sigma)
+        first = estimation.first_state(record, setup.process_noise, bias_sigma=setup.bias_sigma)
     except InputError as error:
         raise InputError(f"{name or 'record'}: {error}") from None
-    return Case(record=record, initial=setup.initial_state(filter_setup, first.attitude), name=name)
+    return Case(record=record, initial=setups.initial_state(setup, first.attitude), name=name)
 
 
 NOISES = (

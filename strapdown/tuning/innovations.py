@@ -304,7 +304,7 @@ def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
 
 def likelihood(
     cases: Sequence[Case],
-    filter_setup: FilterSetup,
+    setup: FilterSetup,
     free: Sequence[str],
     *,
     spacing: float = 0.0,
@@ -316,7 +316,7 @@ def likelihood(
     ----------
     cases : sequence of Case
         Records, with the filter's initial state on each.
-    filter_setup : FilterSetup
+    setup : FilterSetup
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
         Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"initial.attitude"``, ``"initial.bias"``, those of the
@@ -332,7 +332,7 @@ def likelihood(
     Objective
         For :func:`fit`.
     """
-    problem = make_problem(cases, filter_setup, free, spacing=spacing, threads=threads)
+    problem = make_problem(cases, setup, free, spacing=spacing, threads=threads)
     return Likelihood(**vars(problem), prepared=tuple(_prepared(problem, case) for case in problem.cases))
 
 

@@ -45,7 +45,7 @@ MIN_REFUSED = 1e-9
 
 def contaminated_likelihood(
     cases: Sequence[Case],
-    filter_setup: FilterSetup,
+    setup: FilterSetup,
     free: Sequence[str],
     *,
     share: float = SHARE,
@@ -56,7 +56,7 @@ def contaminated_likelihood(
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
-    base = likelihood(cases, filter_setup, free, threads=threads)
+    base = likelihood(cases, setup, free, threads=threads)
     return replace(base, names=(*base.names, *OUTLIERS), start=np.concatenate([base.start, np.log([share, scale])]))
 
 
