@@ -16,6 +16,7 @@ from strapdown.recordings import Recording
 
 ONE = case(duration=20.0)
 ATTITUDE_ALONE = replace(ONE, record=replace(ONE.record, truth=None), true_attitude=ONE.record.truth.attitude)
+SHORT = replace(ONE, record=replace(ONE.record, vectors=tuple(s.taken([0]) for s in ONE.record.vectors)))
 SILENT = replace(ONE.record.vectors[0], sigma=np.zeros(1))
 SILENT = replace(ONE.record, vectors=(SILENT, *ONE.record.vectors[1:]))
 BARE = Recording(source="bare", time=np.arange(5000) / 100.0, rate=np.zeros((5000, 3)))
@@ -63,6 +64,7 @@ TABLE = [
     (free, ("filter.scale", "gyro.arw"), {}, "tune it alone"),
     (free, FREE, {"filter_setup": STEADY}, "gyro.rrw starts from 0"),
     (free, FREE, {"of": replace(ONE, first=1e6)}, "no measurement between"),
+    (workflows.tune, (SHORT,), {"setup": BELIEVED, "free": list(FREE)}, "2 measurements cannot determine 4 parameters"),
     (workflows.tune, (ONE.record,), {"setup": replace(BELIEVED, sigma={"star": 1e-4})}, "sigma: sensor 'star'"),
     (workflows.tune, ([ONE.record, ONE.record],), {"setup": BELIEVED}, "a record is given twice"),
     (tuning.likelihood, ([], BELIEVED, FREE), {}, "no record"),

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys
-from strapdown.tuning.objective import REACH, Derivatives, Objective
+from strapdown.results import counted
+from strapdown.tuning.objective import REACH, Derivatives, Objective, need_measurements
 from strapdown.tuning.parameters import RRW, SCALE, Prior
 from strapdown.tuning.result import NOT_IDENTIFIED, Estimated, Tuning
 
@@ -161,7 +162,7 @@ def fit(
     Raises
     ------
     InputError
-        If a prior names no free parameter, or the search does not converge.
+        If a prior names no free parameter, there are no more measurements than parameters without prior, or the search does not converge.
 
     References
     ----------
@@ -170,6 +171,10 @@ def fit(
     """
     known_keys("priors", priors or {}, objective.names)
     objective = replace(objective, priors=priors or {})
+    measured, free = sum(map(need_measurements, objective.cases)), len(objective.names) - len(objective.priors)
+    if measured <= free:
+        words = f"{counted(measured, 'measurement')} cannot determine {counted(free, 'parameter')}"
+        raise InputError(f"{words}; give more data, or priors")
     spread, shape = np.log(START_FACTOR), (count("starts", starts) - 1, len(objective.start))
     away = np.random.default_rng(seed).uniform(-spread, spread, shape)
     points = np.concatenate([objective.start[None], objective.start + away])

@@ -250,15 +250,15 @@ def _check_case(case: Case, filter_setup: FilterSetup) -> None:
         )
 
 
-def need_measurements(case: Case) -> None:
-    """Refuse a case without measurements in its time."""
+def need_measurements(case: Case) -> int:
+    """Return the number of measurements of a case in its time; refuse none."""
     first, last = case.span
-    for series in case.record.vectors:
-        if np.any(_usable(series) & (series.time >= first) & (series.time <= last)):
-            return
-    raise InputError(
-        f"{case.name or 'record'} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
-    )
+    number = sum(int(np.sum(_usable(s) & (s.time >= first) & (s.time <= last))) for s in case.record.vectors)
+    if not number:
+        raise InputError(
+            f"{case.name or 'record'} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
+        )
+    return number
 
 
 def _usable(series: VectorMeasurements) -> np.ndarray:
