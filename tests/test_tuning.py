@@ -559,6 +559,13 @@ def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector(filter_setup):
     assert objective.derivatives(objective.start).value.sum() + constant == pytest.approx(expected, rel=1e-6)
 
 
+def test_the_information_on_a_common_scale_is_twice_the_number_of_errors():
+    """All σ times s: P ∝ s² and the same errors, so ½ tr((2 P⁻¹ P)²) = 2 n at every epoch."""
+    objective = tuning.error_objective([case(1), case(2)], BELIEVED, ["filter.scale"])
+    number = 6 * sum(len(reference.epochs) for reference in objective.references)
+    assert objective.derivatives(objective.start).information == pytest.approx(2.0 * number, rel=1e-3)
+
+
 def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
     """Outliers of ten σ, one in twenty: a filter that uses them all is right with a larger σ, one that refuses them with the sensor's."""
     cases = [case(seed, outliers=0.05) for seed in range(2)]
