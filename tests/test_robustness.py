@@ -447,13 +447,30 @@ def test_after_a_recovery_on_one_direction_a_second_one_measures_the_turn(runs, 
     assert_inside(anees(estimates, records_, [13, 14, 20], 25)[:, 1], 6, runs, 0.999)
 
 
-def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
-    """Three sensors, one of which is turned by 20° from the start of the record on: the two that agree are used."""
+def contradicted(until):
+    """A record of three sensors, one of which is turned by 20° until a time."""
     third = VectorSensor(name="c", reference_f=np.array([0.3, -1.0, 1.0]), sigma=1e-3, rate=10.0)
     record = simulate(replace(scenario(), sensors=(*scenario().sensors, third)), 6)
     a, b, c = record.vectors
     turned = quaternion.rotate(quaternion.exp([0.2, 0.2, -0.2]), c.vector_b)
-    record = replace(record, vectors=(a, b, replace(c, vector_b=turned)))
+    c = replace(c, vector_b=np.where(c.time[:, None] <= until, turned, c.vector_b))
+    return replace(record, vectors=(a, b, c))
+
+
+def test_a_lock_out_is_reported_in_the_part_in_which_it_ends():
+    record = contradicted(2.0)
+    middle = int(np.searchsorted(record.time, 2.0)) + 1
+    start, gate = started(record, 0, attitude_sigma=1e-3), Gate()
+    first, state = estimation.run_part(records.cut(record, 0, middle), NOISE, start, gate=gate)
+    second, _ = estimation.run_part(records.cut(record, middle, len(record.time) - 1), NOISE, state, gate=gate)
+    assert [(event.kind, event.end) for event in first.events] == [("lock-out", pytest.approx(2.0))]
+    assert second.events == ()
+
+
+def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
+    """The two that agree are used."""
+    record = contradicted(np.inf)
+    c = record.vectors[2]
     estimate = estimation.run(record, NOISE, started(record, 0, attitude_sigma=1e-3), gate=Gate())
     (event,) = estimate.events
     assert (event.kind, event.sensor, event.value) == ("lock-out", "c", len(c.time))

@@ -442,6 +442,25 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     assert part.events == whole.events
 
 
+def test_a_candidate_that_is_lost_from_its_start_is_left_behind() -> None:
+    """Two sensors that measure at once, with outliers in the first second: a candidate refuses what is measured at its start."""
+    sensors = tuple((kind, axis, sigma, (0.1, 0.04)) for kind, axis, sigma, _ in WELL_SEEN.sensors)
+    for seed, recovery in ((47, 2), (82, 4), (87, 4)):
+        record, initial = far_off(seed, sensors)
+        rng = np.random.default_rng([1, seed])
+        vectors = []
+        for s in record.vectors:
+            outliers = (rng.random(len(s.time)) < 0.15) & (s.time < 1.0)
+            turned = quaternion.rotate(quaternion.exp(rng.standard_normal((len(s.time), 3))), s.vector_b)
+            vectors.append(dataclasses.replace(s, vector_b=np.where(outliers[:, None], turned, s.vector_b)))
+        record = dataclasses.replace(record, vectors=tuple(vectors))
+        gate = dataclasses.replace(GATE, recovery=recovery)
+        smoothed = estimation.smooth(record, NOISE, initial, gate=gate, full_covariance=True)
+        (event,) = recoveries(smoothed)
+        last = int(np.searchsorted(record.time, event.end))
+        assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[last:]) < 5.0
+
+
 def test_memory_does_not_grow_with_the_number_of_recoveries() -> None:
     record, initial = simulated(dataclasses.replace(WELL_SEEN, duration=120.0), np.random.default_rng(1))
     peaks = []
