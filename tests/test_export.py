@@ -537,6 +537,27 @@ def test_kernels_with_branches_and_loops_are_those_of_python(tmp_path):
             np.testing.assert_array_equal(a.ravel(), other[:])
 
 
+def written(a):
+    a[0, 1] = 1.0
+    return True
+
+
+def hasty(a, x):
+    return 2.0 if x > 0.0 and written(a) else 1.0
+
+
+def test_an_operand_that_writes_is_refused_because_the_target_evaluates_it_always():
+    m = Function("work", [("a", -12), ("x", 0)], returns="real")
+    own = Function("written", [("a", -12)], returns="int")
+    Interpreter(own, {})(written, Member(own, "a", (6, 2)))
+    m.functions, m.name_of = {"written": own}, lambda function, known: function.__name__
+    inline = Interpreter(m, {})
+    of_target = Interpreter(m, {"written": lambda a: inline._call_own(written, [a])})
+    for execute in (inline, of_target):
+        with pytest.raises(TypeError, match="operand of `and` or `or` after the first writes to an array"):
+            execute(hasty, Member(m, "a", (6, 2)), m.argument("x"))
+
+
 def test_values_read_before_an_effect_are_those_before_it(tmp_path):
     """A load may not move behind a call or a branch that changes the array, nor be remembered after it."""
     m = Function("work", [("x", 0)])

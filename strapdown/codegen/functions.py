@@ -71,6 +71,7 @@ class Member(Values):
             return
         self.function.flush()
         self.function.add(Statement("put", self.base, values=(place, value)))
+        self.trace.writes += 1
         self.forget()
 
 

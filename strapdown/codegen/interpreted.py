@@ -62,9 +62,12 @@ class Expressions(ast.NodeTransformer):
         return parts[0] if len(parts) == 1 else called("_chain_", *parts)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
-        """Evaluate all operands."""
+        """Evaluate all operands, of which only the first may write to an array."""
         self.generic_visit(node)
-        return called("_and_" if isinstance(node.op, ast.And) else "_or_", *node.values)
+        none = ast.arguments([], [], None, [], [], None, [])
+        first, *others = node.values
+        others = [called("_read_only_", ast.Lambda(none, operand)) for operand in others]
+        return called("_and_" if isinstance(node.op, ast.And) else "_or_", first, *others)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
         """Negate a condition."""
@@ -143,6 +146,7 @@ def mathematics(trace: Trace) -> dict[str, Any]:
         "_and_": joined("&&"),
         "_chain_": joined("&&"),
         "_or_": joined("||"),
+        "_read_only_": trace.read_only,
         "_no_": lambda x: trace.symbol("not", x) if isinstance(x, Symbol) else not x,
         "_equal_": lambda a, b: trace.symbol("==", a, b) if isinstance(a, Symbol) or isinstance(b, Symbol) else a == b,
     }
@@ -423,6 +427,7 @@ class Interpreter:
             }
             m.define(function, sizes, known)
         target = m.functions[name]
+        self.trace.writes += target.trace.writes
         if not target.results:
             result = {"": None, "real": ""}.get(target.returns, target.returns)
             return m.call(name, *passed.values(), result=result)

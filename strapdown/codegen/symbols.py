@@ -101,6 +101,8 @@ class Trace:
         self.outcomes: dict[Any, bool] = {}
         """Conditions in the branches that are traced at present."""
         self.arrays: list[Values] = []
+        self.writes = 0
+        """Number of writes to elements of arrays."""
         self.place: Any = None
         """Block of the function in which symbols are made at present."""
 
@@ -148,6 +150,13 @@ class Trace:
                 return y if x == (kind == "&&") else x
         return self.symbol(kind, a, b)
 
+    def read_only(self, operand: Callable[[], Any]) -> Any:
+        """Return the value of an operand, which the target evaluates even if Python would not."""
+        before, value = self.writes, operand()
+        if self.writes > before:
+            raise TypeError("an operand of `and` or `or` after the first writes to an array; write it as an `if`")
+        return value
+
     # ------------------------------------------------------------------------------------ functions that kernels find by these names
 
     def square_root(self, x: Any) -> Any:
@@ -192,6 +201,7 @@ class Values:
 
     def __setitem__(self, i: Any, value: Any) -> None:
         self.known[i] = self.changed[i] = value
+        self.trace.writes += 1
 
     def forget(self) -> None:
         """Forget the elements: the target may have other values now."""
