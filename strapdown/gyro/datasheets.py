@@ -56,7 +56,7 @@ def parse(name: str, text: str, wanted: str, example: str) -> float:
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example}")
     number = re.match(r"\s*[±<≤]?\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)", text)
     unit_text = text[number.end() :] if number else text
-    plain = re.sub(r"√(\w+)", r"sqrt(\1)", unit_text.replace("°", " deg").replace("″", " arcsec"))
+    plain = re.sub(r"(?:√|\brt)\(?(\w+)\)?", r"sqrt(\1)", unit_text.replace("°", " deg").replace("″", " arcsec"))
     symbols = {
         r"\bg\b": "standard_gravity",
         r"\bhr?\b": "hour",
