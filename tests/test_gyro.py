@@ -107,7 +107,7 @@ def test_jitter_and_stamps():
     assert np.std(true - edges) == pytest.approx(1e-4, rel=0.03)
     assert np.std(stamps - edges) == pytest.approx(2e-4, rel=0.03)
     assert np.mean(stamps - edges) == pytest.approx(3e-3, abs=1e-5)
-    wild, _ = gyro.sampling(GyroSpec(sampling_jitter=1.0), edges, generator(1, 0, "t"))
+    wild, _ = gyro.sampling(GyroSpec(sampling_jitter=3.9e-3), edges, generator(1, 0, "t"))
     assert np.all(np.diff(wild) > 0.0)
     same, also = gyro.sampling(GyroSpec(), edges, generator(1, 0, "t"))
     assert np.array_equal(same, edges)
@@ -440,6 +440,12 @@ def test_units_convert(name, unit, factor):
 
 
 SHEET = datasheets.from_datasheet
+
+
+def sampled(**errors):
+    return gyro.sampling(GyroSpec(**errors), np.arange(11) * 0.01, generator(1, 0, "t"))
+
+
 # fmt: off
 REFUSED = [
     *((GyroSpec, {field: value}, field) for field, value in (
@@ -454,6 +460,8 @@ REFUSED = [
     (simulate, {"spec": GyroSpec(g_sensitivity=np.eye(3))}, "specific_force"),
     (simulate, {"spec": GyroSpec(temperature=warming(1.0))}, "temperature"),
     (gyro.process_noise, {"spec": GyroSpec(bias_instability=1.0)}, "bandwidth"),
+    (sampled, {"sampling_jitter": 0.011}, r"sampling_jitter is 0.011 s; it must be below 0.4 sample intervals, 0.004 s"),
+    (sampled, {"timestamp_error": 0.011}, "timestamp_error is 0.011 s"),
     (SHEET, {"arw": "0.15 deg/h"}, r"arw is '0.15 deg/h' \(in radian / second\).*deg/sqrt\(h\)"),
     (SHEET, {"bias_instability": "0.5 deg/sqrt(h)"}, "bias_instability.*deg/h"),
     (SHEET, {"rrw": "0.5 deg/sqrt(h)"}, "rrw.*deg/h/sqrt"),

@@ -79,9 +79,9 @@ class GyroSpec(ByValue):
     rate_resolution : float or ndarray (3,), default 0.0
         Resolution of a rate output, rad/s: each averaged rate is rounded separately, without carrying the remainder.
     sampling_jitter : float, default 0.0
-        Standard deviation of the sampling instants about the nominal ones, s.
+        Standard deviation of the sampling instants about the nominal ones, s; below 0.4 sample intervals.
     timestamp_error : float, default 0.0
-        Standard deviation of the time stamps about the nominal instants, s.
+        Standard deviation of the time stamps about the nominal instants, s; below 0.4 sample intervals.
     timestamp_offset : float, default 0.0
         Delay of the time stamps after the nominal instants, s.
     drop_probability : float, default 0.0

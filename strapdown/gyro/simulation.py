@@ -246,6 +246,9 @@ def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -
     nominal = increasing("edges", edges, minimum=2)
     most = 0.4 * float(np.diff(nominal).min())
     draws = generator.standard_normal((2, len(nominal)))
+    for name in ("sampling_jitter", "timestamp_error"):
+        if (sigma := getattr(spec, name)) >= most:
+            raise InputError(f"{name} is {sigma:g} s; it must be below 0.4 sample intervals, {most:g} s")
     jitter, error = np.clip(np.multiply([[spec.sampling_jitter], [spec.timestamp_error]], draws), -most, most)
     return nominal + jitter, nominal + spec.timestamp_offset + error
 
