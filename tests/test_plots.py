@@ -201,8 +201,8 @@ def test_coning_errors_are_those_about_the_cones_axis(outcomes):
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
     with pytest.raises(InputError, match="truth is None"):
-        plots.error_overview(estimate, None)
-    figure = plots.error_overview(estimate, truth)
+        plots.error_overview(dataclasses.replace(estimate, truth=None))
+    figure = plots.error_overview(dataclasses.replace(estimate, truth=truth))
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     for state, ax in enumerate(np.reshape(figure.axes, (3, 2)).T.ravel()):
         unit, size = (("arcsec", units.ARCSECOND), ("°/h", units.DEGREE_PER_HOUR))[state // 3]

@@ -229,15 +229,15 @@ def state_errors(estimate: Estimate, truth: Truth) -> list[StateError]:
     return states
 
 
-def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figure:
-    """Draw the six errors relative to the truth with the filter's ±3σ: attitude left, bias right.
+def error_overview(estimate: Estimate, truth: Truth | None = None, *, title: str = "") -> Figure:
+    """Draw the six errors relative to a truth with the filter's ±3σ: attitude left, bias right.
 
     Parameters
     ----------
     estimate : Estimate
         Attitude and bias with their σ.
-    truth : Truth
-        Truth at the times of the estimate.
+    truth : Truth, optional
+        Truth at the times of the estimate. Default: the estimate's own.
     title : str
         Name of the estimate, for the title.
 
@@ -246,7 +246,9 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     Figure
         Attitude errors as a rotation vector in body axes, ``q_true = q_est ⊗ exp(δθ)``.
     """
+    truth = estimate.truth if truth is None else truth
     instance("truth", truth, Truth, "give that of the record, record.truth")
+    assert truth is not None
     drawn = state_errors(estimate, truth)
     if not drawn:
         raise InputError("truth has no attitude at a time of the estimate; give one that is known there")
@@ -272,7 +274,7 @@ def draw_estimate(
     if estimate.error_states:
         figures[target / "states"] = states_over_time(estimate, title=title)
     if truth is not None and truth.has_bias:
-        figures[target / "errors"] = error_overview(estimate, truth, title=title)
+        figures[target / "errors"] = error_overview(estimate, title=title)
     elif truth is not None:
         figures[target / "errors"] = recording_errors(estimate, truth.attitude, truth.movement)
     return style.save_as(figures, form)
