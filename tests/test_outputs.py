@@ -245,6 +245,8 @@ def test_what_an_ending_has_no_room_for_is_refused(case, tmp_path):
     estimate, _ = case
     with pytest.raises(InputError, match=r"ends in '.xls', but an estimate is written as .bag, "):
         recordings.write(estimate, tmp_path / "x.xls")
+    with pytest.raises(InputError, match=r"x.xls must end in one of .h5, "):
+        sd.write(estimate, tmp_path / "x.xls")
     with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no option `sequence=` \(known: `frame=`\)"):
         recordings.write(estimate, tmp_path / "x.tum", sequence="ZYX")
     with pytest.raises(InputError, match="needs the samples too; give the recording"):

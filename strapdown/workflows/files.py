@@ -130,5 +130,8 @@ def write(
         save: Callable[..., None] = setups.write_estimate if isinstance(content, Estimate) else recordfiles.write_record
         save(path, content, **options)
     else:
+        endings = recordings.writers("write_estimate" if isinstance(content, Estimate) else "write")
+        if not isinstance(content, Recording) and Path(path).suffix.lower() not in endings:
+            raise InputError(f"{path} must end in one of {', '.join((*HDF5, *endings))}")
         recordings.write(content, path, **options)
     return Path(path)
