@@ -33,7 +33,8 @@ class AttitudeSensor(Sampled):
     sigma_across : float
         Noise about the two axes across the boresight, rad.
     sigma_about : float
-        Noise about the boresight, rad.
+        Noise about the boresight, rad. A linear filter is optimistic, and its covariance analysis does not show it, if half the product of
+        ``sigma_about`` and the predicted σ across the boresight is not small compared with ``sigma_across``.
     boresight : {"x", "y", "z"} or array_like (3,), default "z"
         Boresight: a body axis, or a direction in body axes. Stored as an axis or a unit vector.
     """
