@@ -410,7 +410,7 @@ def test_usual_frames_are_named():
             recordings.Attitudes.from_arrays(np.arange(300) / 10.0, quaternion.from_rotation(q)) for q in (own, truth)
         )
         remarks = " ".join(consistency.check_attitudes(*both).remarks)
-        assert re.findall(r"an axis, as ([\w-]+ and [\w-]+) do", remarks) == words
+        assert re.findall(r"per axis, as ([\w-]+ and [\w-]+) do", remarks) == words
 
 
 def test_frames_and_clock_are_found_and_removed(replayed):
