@@ -283,10 +283,10 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succe
     # About the two level axes, which the accelerometer shows: the bias at turn-on all the time, and c_0 has no interval.
     off = np.abs(estimate.bias - np.array([360.0, 0.0, -360.0]) * DEGREE_PER_HOUR)[:, :2]
     assert (off < 4.0 * estimate.sigma[:, 3:5]).all()
-    assert off[estimate.time > estimate.time[0] + 1.1].max() < 5e-4  # after the second at rest that measures it
-    assert (
-        estimate.sigma[-1, 3] < 6e-4
-    )  # of 9e-4 after that second; the velocity of a hand without magnetometer has a σ of 3 m/s
+    rested = estimate.time > estimate.time[0] + 1.1
+    assert off[rested].max() < 5e-4  # after the second at rest that measures it
+    # The accelerometer shows a little more; the reported σ has the factor for the share of the bias's first variance that is left.
+    assert estimate.sigma[-1, 3] < 0.75 * estimate.sigma[rested][0, 3]
 
 
 @pytest.mark.parametrize(("axes", "others"), [(1, 1.0), (3, 1.0), (3, 0.2)], ids=["one", "alike", "one much larger"])
