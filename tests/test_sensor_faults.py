@@ -404,7 +404,8 @@ def test_a_rate_that_changes_in_one_interval_is_used():
     rate[1000:, 2] += 30.0
     assert sensor_faults.find(dataclasses.replace(plain, rate=rate)).words == ()
     shaken = plain.rate + np.outer(np.where(np.arange(len(rate)) % 2, 4.0, -4.0), [0.0, 1.0, 0.0])
-    assert len(sensor_faults.damaged_rates(shaken, plain.interval)) == 0
+    bend = sensor_faults.second_differences(shaken)
+    assert len(sensor_faults.damaged_rates(shaken, bend, plain.interval)) == 0
 
 
 def test_an_ordinary_recording_has_no_faults():

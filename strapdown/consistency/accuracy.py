@@ -13,14 +13,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, are_finite, array
-from strapdown.consistency.alignment import (
-    ALIGNED,
-    Alignment,
-    Series,
-    align_series,
-    at_common_times,
-    in_common_frames,
-)
+from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_common_frames
 from strapdown.consistency.manifold import nees
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth

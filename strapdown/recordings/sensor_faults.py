@@ -85,8 +85,11 @@ class Faults:
 
 def find(recording: Recording) -> Faults:
     """Return the faults of a recording's samples, with the corrected recording."""
-    measured, words = _measured(recording)
-    changes: dict[str, Any] = {} if measured is recording.rate else {"rate": measured}
+    bend = second_differences(recording.rate)
+    measured, words = _measured(recording, bend)
+    changes: dict[str, Any] = {}
+    if measured is not recording.rate:
+        changes["rate"], bend = measured, second_differences(measured)
     rate, variance, clipped = restored(recording.time, measured)
     if clipped.any():
         changes["rate"] = rate
@@ -108,7 +111,6 @@ def find(recording: Recording) -> Faults:
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     steps = np.diff(recording.time)
     usual = recording.interval
-    bend = second_differences(measured)
     # The trapezoidal rule errs by T³/12 times the second derivative of the rate over an interval T.
     sampling = float(np.sqrt(usual * np.mean(bend**2)) / 12.0) if len(bend) else 0.0
     if sampling > MAX_SAMPLING_ERROR:
@@ -143,10 +145,13 @@ def find(recording: Recording) -> Faults:
     return Faults(recording=corrected(recording, **changes), turn_variance=variance, words=tuple(words))
 
 
-def _measured(recording: Recording) -> tuple[Array, list[str]]:
-    """Return the gyro's rates (n, 3) with damaged samples replaced and truncation reversed, and the description of both."""
+def _measured(recording: Recording, bend: Array) -> tuple[Array, list[str]]:
+    """Return the gyro's rates (n, 3) with damaged samples replaced and truncation reversed, and the description of both.
+
+    ``bend``: :func:`second_differences` of the rates as recorded.
+    """
     rate, words = recording.rate, []
-    damaged = damaged_rates(rate, recording.interval)
+    damaged = damaged_rates(rate, bend, recording.interval)
     if len(damaged):
         rate = rate.copy()
         rate[damaged] = 0.5 * (rate[damaged - 1] + rate[damaged + 1])
@@ -161,10 +166,13 @@ def _measured(recording: Recording) -> tuple[Array, list[str]]:
     return rate, words
 
 
-def damaged_rates(rate: Array, interval: float) -> np.ndarray:
-    """Return the samples (m,) among rates (n, 3) at an interval, s, that are far from both beside them, which agree."""
+def damaged_rates(rate: Array, bend: Array, interval: float) -> np.ndarray:
+    """Return the samples (m,) among rates (n, 3) at an interval, s, that are far from both beside them, which agree.
+
+    ``bend``: their :func:`second_differences`.
+    """
     least = MAX_CHANGE + MAX_ACCELERATION * interval
-    rows = 1 + np.flatnonzero(second_differences(rate) > least)  # hardly any
+    rows = 1 + np.flatnonzero(bend > least)  # hardly any
     before, after = rate[rows - 1], rate[rows + 1]
     change = np.minimum(lengths(rate[rows] - before), lengths(rate[rows] - after))
     return rows[(change > least) & (change > 2.0 * lengths(after - before))]
