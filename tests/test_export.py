@@ -105,7 +105,7 @@ def case(name):
     record = dataclasses.replace(record, vectors=tuple(map(whole, record.vectors)))
     setup = sd.FilterSetup(
         process_noise=NOISE,
-        attitude_sigma=0.4,
+        attitude_sigma=0.8,
         bias_sigma=5e-3,
         gate=gate,
         states=None if states is None else STATES[states],
@@ -342,7 +342,7 @@ def test_the_header_has_the_sigma_of_each_axis():
     for words in (
         "sigma about body x, y, z (0.001, 0.001, 0.01) rad = (0.0573, 0.0573, 0.573) deg.",
         "sigma 0.02 rad = 1.146 deg.",
-        "sigma 0.4 rad = 22.92 deg about each axis, and at zero bias, sigma 0.005 rad/s.",
+        "sigma 0.8 rad = 45.84 deg about each axis, and at zero bias, sigma 0.005 rad/s.",
     ):
         assert words in header
 

@@ -23,14 +23,12 @@ from strapdown.estimation.live import template
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import with_sigma
 from strapdown.kernels.measurement import KIND_CODES
-from strapdown.kernels.structure import MAX_PRECISION, Model
+from strapdown.kernels.structure import MAX_PRECISION_SINGLE, Model
 from strapdown.records import ImuRecord
 from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import VectorMeasurements, VectorSensor, triad
 
 EXPORTED = "the exported filter"
-MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
-"""The same limit as :data:`strapdown.kernels.structure.MAX_PRECISION` in single precision."""
 
 
 def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements], *, single: bool) -> Program:
@@ -59,7 +57,7 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
             for vectors, shape in zip(series, model.shape, strict=True)
         ),
         thresholds=None if setup.gate is None else tuple(float(x) for x in setup.gate.thresholds),
-        max_precision=MAX_PRECISION_SINGLE if single else MAX_PRECISION,
+        single=single,
         covariance=tuple(map(tuple, covariance.tolist())),
         state_names=tuple(
             f"{block.name} {component} ({unit})"

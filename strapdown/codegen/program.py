@@ -18,7 +18,7 @@ from strapdown.kernels.algebra import dot, scale, square_root
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
 from strapdown.kernels.rotation import far_turn as far_turn_kernel
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
-from strapdown.kernels.structure import Measured, Model, Structure
+from strapdown.kernels.structure import MAX_PRECISION, MAX_PRECISION_SINGLE, Measured, Model, Structure
 from strapdown.kernels.walk import turn_squared
 
 MAX_TURN = 100.0
@@ -80,8 +80,8 @@ class Program:
     sensors: tuple[Sensor, ...]
     thresholds: tuple[float, ...] | None
     """Maximum NIS for 1, 2, 3 degrees of freedom; None: no gate."""
-    max_precision: float
-    """Maximum ratio of an innovation's variance to the measurement's."""
+    single: bool
+    """Whether numbers are of single precision."""
     covariance: tuple[tuple[float, ...], ...]
     """Initial covariance of all states (n, n)."""
     state_names: tuple[str, ...] = ()
@@ -99,9 +99,14 @@ class Program:
         }
 
     @property
+    def max_precision(self) -> float:
+        """Maximum ratio of an innovation's variance to the measurement's."""
+        return MAX_PRECISION_SINGLE if self.single else MAX_PRECISION
+
+    @property
     def kernels(self) -> ModuleType:
         """Kernels of an update for the structure, in the layout in which each element of P is a number."""
-        return machine.instance(update_kernels, STRUCTURE=self.structure, LANES=2)
+        return machine.instance(update_kernels, STRUCTURE=self.structure, LANES=2, SINGLE=self.single)
 
     @property
     def prediction(self) -> ModuleType:

@@ -35,9 +35,7 @@ from strapdown.kernels.lane_values import all_lanes, any_lane, select
 from strapdown.kernels.measurement import direction_rows
 from strapdown.kernels.rotation import far_turn, logarithm, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.series import SQUARED_RANGE, fifth, fourth, second, sinc, third
-
-SHORT_FORM = 1000.0
-"""Maximum ratio of innovation variance to measurement variance for the short form, which then loses at most three digits."""
+from strapdown.kernels.structure import SHORT_FORM
 
 
 def transition(phi, dt):

@@ -15,12 +15,14 @@ from __future__ import annotations
 
 from strapdown.kernels.lane_values import lanes_of, load_like, store
 from strapdown.kernels.measurement import degrees_of_freedom
-from strapdown.kernels.structure import SIX_STATES, Structure
+from strapdown.kernels.structure import SHORT_FORM, SHORT_FORM_SINGLE, SIX_STATES, Structure
 
 STRUCTURE: Structure = globals().get("STRUCTURE", SIX_STATES)
 """Structure of the model, given by :func:`strapdown.kernels.machine.instance`."""
 LANES: int = globals().get("LANES", 1)
 """Number of runs in a value, likewise."""
+SINGLE: bool = globals().get("SINGLE", False)
+"""Whether numbers are of single precision, as exported code can be."""
 PARAMETERS: bool = globals().get("PARAMETERS", False)
 """Whether the runs differ in noise and error states, instead of gyro and measurements: numbers of the model are lanes."""
 
@@ -37,6 +39,7 @@ SIZE_OF_P = N * W if LANES == 1 else N * (N + 1) // 2 * LANES
 CHUNKS = tuple(range(0, W, 8)) if LANES == 1 else STATES
 """First column of each chunk of a row."""
 EIGHT = (0.0,) * 8
+MAX_SHORT = SHORT_FORM_SINGLE if SINGLE else SHORT_FORM
 
 # Lines of the work space, each of LINE values.
 LINE = W + 8

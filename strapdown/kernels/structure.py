@@ -10,8 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_PRECISION = 5e13
-"""Maximum ratio of an innovation's variance to the measurement's: a covariance in double precision then keeps three digits."""
+SHORT_FORM, SHORT_FORM_SINGLE = 1000.0, 100.0
+"""Maximum ratio of an innovation's variance to the measurement's for the short form ``P − Σ g gᵀ`` of an update, which loses as many digits
+as the ratio has; and that in single precision."""
+MAX_PRECISION, MAX_PRECISION_SINGLE = 5e13, 2.0**23
+"""Maximum such ratio of all: a covariance in double precision then keeps three digits; and that in single precision."""
 
 
 class GyroState(NamedTuple):

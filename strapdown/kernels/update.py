@@ -20,6 +20,7 @@ from strapdown.kernels.layout import (
     GAINS,
     LANES,
     LINE,
+    MAX_SHORT,
     PARAMETERS,
     PRODUCT,
     RESIDUAL,
@@ -56,8 +57,6 @@ PLAIN = tuple(k for k in STATES if k not in ROTATED)
 BLOCKS = tuple(PLAIN[i : i + 4] for i in range(0, len(PLAIN), 4)) if LANES > 1 else (CHUNKS,)
 """Chunks of a row that are computed together, for all rows: four columns, whose gains stay in registers."""
 
-SHORT_FORM = 100.0
-"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses at most two digits."""
 JOSEPH_FORM = 1e8
 """Maximum ratio for Joseph's form, whose rounding is up to 2e-8 of the measurement's variance at this ratio."""
 
@@ -98,7 +97,7 @@ def gains(s, x, P, work, measured, numbers, factor, like):
         step = tuple(plus(t, weight * u) for t, u in zip(step, p[i], strict=True))
         root = square_root(inverted[i])
         gain.append(stored_row(tuple(root * t for t in p[i]), work, LINE * (GAINS + i)))
-        far = variances[i] > SHORT_FORM * r[i]
+        far = variances[i] > MAX_SHORT * r[i]
         precise = far if precise is None else precise | far
     for variance in r[len(rows) :]:  # that of the length is part of the innovation
         variances.append(variance)
@@ -252,7 +251,7 @@ def take_row(P, work, line, residual, variance, like):
         t = inverted * value_at(work, p + i, like)
         put_at(work, p + i, t)
         put_at(work, step + i, value_at(work, step + i, like) + error * t)
-    precise = s > SHORT_FORM * variance
+    precise = s > MAX_SHORT * variance
     if any_lane(precise):
         d = LINE * ROUNDING
         product(P, work, first, d, like)
