@@ -210,6 +210,12 @@ def test_each_term_has_a_stream_of_its_own():
     np.testing.assert_allclose(walk, simulate(GyroSpec(rate_random_walk=2.0)).bias, atol=1e-10)
 
 
+@pytest.mark.parametrize("term", ["angle_random_walk", "rate_random_walk", "bias_instability", "markov_noise"])
+def test_an_axis_without_a_term_has_none_of_its_neighbours(term):
+    noise = simulate(GyroSpec(**{term: [1.0, 2.0, 0.0]})).increments
+    assert np.any(noise != 0.0, axis=0).tolist() == [True, True, False]
+
+
 def test_a_run_is_the_same_however_often_and_differs_from_others():
     spec = GyroSpec(angle_random_walk=1.0, rate_random_walk=1.0, bias_instability=1.0)
     first, again = simulate(spec, run=3), simulate(spec, run=3)

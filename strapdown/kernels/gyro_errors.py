@@ -47,8 +47,8 @@ def gauss_markov(decay, steps, values):
             values[k + 1, i] = decay[k] * values[k, i] + steps[k, i]
 
 
-def flicker_block(poles, gains, states, scale, normals, out):
-    """Fill out (m,) with flicker noise, and update its 16 states: x ← p x + w, out = scale g · x."""
+def flicker_block(poles, gains, states, normals, out):
+    """Fill out (m,) with flicker noise of B = 1, and update its 16 states: x ← p x + w, out = g · x."""
     c, x = gains, states
     for k in range(out.shape[0]):
         w = normals[k]
@@ -58,7 +58,7 @@ def flicker_block(poles, gains, states, scale, normals, out):
         s1 = ((c[1] * x[1] + c[5] * x[5]) + c[9] * x[9]) + c[13] * x[13]
         s2 = ((c[2] * x[2] + c[6] * x[6]) + c[10] * x[10]) + c[14] * x[14]
         s3 = ((c[3] * x[3] + c[7] * x[7]) + c[11] * x[11]) + c[15] * x[15]
-        out[k] = scale * ((s0 + s2) + (s1 + s3))
+        out[k] = (s0 + s2) + (s1 + s3)
 
 
 class Errors(NamedTuple):
@@ -132,7 +132,7 @@ def drift_and_noise(edges, true_increments, errors, drift, draws, increments, bi
                 fill_normals(streams[axis, MARKOV], words, wandering)
             if flicker[axis] > 0.0:
                 fill_normals(streams[axis, FLICKER], words, whites)
-                flicker_block(poles, gains, flicker_states[axis], flicker[axis], whites, flickering[:m])
+                flicker_block(poles, gains, flicker_states[axis], whites, flickering[:m])
             if white[axis] > 0.0 or walk[axis] > 0.0 or markov[axis] > 0.0:
                 fill_normals(streams[axis, WHITE], words, whites)
             a0 = matrix[axis, 0]
@@ -153,7 +153,7 @@ def drift_and_noise(edges, true_increments, errors, drift, draws, increments, bi
             known = -1.0  # interval that the coefficients above hold for, to a part in 1e9
             for i in range(m):
                 k = first + i
-                now = flickering[i]
+                now = flicker[axis] * flickering[i]
                 b = steady + slope * (edges[k] - start) + r + g
                 bias[k, axis] = b + 0.5 * (before + now)
                 before = now
