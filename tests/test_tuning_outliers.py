@@ -304,6 +304,13 @@ def test_outliers_are_found_beside_correlated_noise_that_has_states():
     assert tuned.setup.gate == gate.gate
 
 
+def test_outliers_that_the_tuned_gate_rejects_are_not_said_to_be_unmodelled():
+    record = scenarios.simulate(scenario(100.0), 1)
+    for gate in (True, False):
+        tuned = sd.tune(record, free=["star 1.sigma"], starts=1, threads=1, gate=gate)
+        assert ("the outliers of the star 1" not in " ".join(tuned.words)) == gate == (tuned.setup.gate is not None)
+
+
 def test_where_there_is_none_there_is_no_gate():
     wrong = tuning.with_values(BELIEVED, WRONG)
     objective = tuning.contaminated_likelihood([case(1, 600.0, 0.0)], wrong, FREE)

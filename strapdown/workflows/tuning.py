@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from strapdown import ahrs
 from strapdown.checks import Hint, InputError, count, instance, one_of
 from strapdown.estimation import setup as setups
+from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
@@ -89,9 +90,9 @@ def tune(
     count("seed", seed, minimum=0)
     instance("free", () if free is None else free, (list, tuple), "give a list of names")
     threads = count("threads", threads if threads is not None else os.cpu_count() or 1)
-    own, by_name = setup is not None, _by_name(sources)
-    setup, cases, remarks = _cases(by_name, setup, states)
     gate = gate or any(name in tuning.GATED for name in free or ())
+    own, by_name = setup is not None, _by_name(sources)
+    setup, cases, remarks = _cases(by_name, setup, states, gate)
     if own and (setup.gate or setup.robust) and not (truth or gate):
         remarks.append(
             "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. "
@@ -136,9 +137,9 @@ def _by_name(sources: Source | Sequence[Source] | Mapping[str, Source]) -> Mappi
 
 
 def _cases(
-    sources: Mapping[str, Source], setup: FilterSetup | None, states: bool | None
+    sources: Mapping[str, Source], setup: FilterSetup | None, states: bool | None, gate: bool
 ) -> tuple[FilterSetup, list[Case], list[str]]:
-    """Return the initial filter, the records with the filter's initial states, and remarks on the filter."""
+    """Return the initial filter, the records with the filter's initial states, and remarks on the filter, which may get a gate."""
     from strapdown import tuning
 
     own, remarks, cases = setup is not None, list[str](), []
@@ -153,7 +154,8 @@ def _cases(
                 raise InputError(
                     f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
                 )
-            setup, remarks = matched_filter(record, states=states)
+            setup, remarks = matched_filter(record, states=states, changes={"gate": Gate()} if gate else None)
+            setup = dataclasses.replace(setup, gate=None)
         elif own and states:
             if setup.states is not None:
                 raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
