@@ -269,6 +269,15 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
     sigma = setup.FilterSetup.for_scenario(curved, states=True).states.gyro_temperature_sigma
     np.testing.assert_allclose(sigma, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
+    # A parabola c₂ (T − T₀)² over T₀ ± h is at most 2/3 c₂ h² from its line of least squares, at the ends.
+    beyond = replace(
+        linear, temperature=scenarios.Temperature(start=5.0, end=40.0)
+    )  # below the span the bias is constant
+    for case, said in ((linear, False), (curved, True), (beyond, True)):
+        origin = records.Origin(gyro=case.gyro, scenario=case)
+        words = setup.unmodelled_errors(origin, setup.FilterSetup.for_scenario(case, states=True))
+        assert any("curve of the gyro's bias over temperature" in text for text in words) == said
+    assert curved.temperature_curve == pytest.approx(1e-6 * 10.0**2 * 2.0 / 3.0, rel=1e-2)
     plan = montecarlo.Plan(scenario=linear, setup=setup.FilterSetup.for_scenario(linear, states=True))
     assert "bias over temperature" in lanes.supports(plan)
     drawn_only = replace(warm, coefficients=np.zeros((2, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3]))

@@ -159,6 +159,17 @@ class Scenario(ByValue):
         words = f"the gyro's saturation at {limit / DEGREE:.4g} °/s in {np.sum(beyond)} of {len(beyond)} samples"
         return words if beyond.any() else ""
 
+    @functools.cached_property
+    def temperature_curve(self) -> float:
+        """Maximum deviation of the gyro's bias from a line over the temperatures of the record, rad/s; 0 below 1 % of its change."""
+        if self.gyro.temperature is None or self.temperature is None:
+            return 0.0
+        T = self.temperature._at(self.edges)
+        bias = self.gyro.temperature.bias(T)
+        line = np.column_stack([np.ones_like(T), T - T[0]])
+        deviation = np.abs(bias - line @ np.linalg.lstsq(line, bias)[0])
+        return float(np.max(np.where(deviation > 0.01 * np.ptp(bias, axis=0), deviation, 0.0)))
+
     @property
     def late_motion(self) -> str:
         """Time at which the motion first changes if that is after the end, in words; empty if it is not."""

@@ -97,8 +97,15 @@ def specified_errors(origin: Origin) -> list[SpecifiedError]:
     if origin.gyro is None:
         return []
     sensors, gravity_f = specified(origin)
-    saturation = "" if origin.scenario is None else origin.scenario.saturation
-    terms = [*_of_gyro(origin.gyro, gravity_f), (bool(saturation), SpecifiedError("gyro", "saturation", saturation))]
+    saturation, curve = (
+        ("", 0.0) if origin.scenario is None else (origin.scenario.saturation, origin.scenario.temperature_curve)
+    )
+    bent = f"the curve of the gyro's bias over temperature, up to {curve / units.DEGREE_PER_HOUR:.3g} °/h from a line"
+    terms = [
+        *_of_gyro(origin.gyro, gravity_f),
+        (bool(saturation), SpecifiedError("gyro", "saturation", saturation)),
+        (curve, SpecifiedError("gyro", "curve over temperature", bent, analysed=False)),
+    ]
     for sensor in sensors:
         terms += _of_sensor(sensor)
     return [error for size, error in terms if np.any(size)]
