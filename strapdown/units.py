@@ -46,6 +46,7 @@ _STATE_UNITS: dict[str, dict[str, tuple[str, float]]] = {
     **{f"attitude {axis}": {"rad": ("°", DEGREE)} for axis in "xyz"},
     "gyro bias": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
     "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
+    "gyro misalignment": {"rad": ("mrad", 1e-3)},
     "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
     "gyro temperature": {"rad/s/K": ("°/h/K", DEGREE_PER_HOUR)},
     "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},

@@ -418,6 +418,7 @@ def test_states_of_a_direction_are_printed_relative_to_its_vector(record):
         assert [block.units for block in blocks] == [(unit,) * 3] * 2
     assert units.error_state_unit("c disturbance x", "rad") == ("arcsec", units.ARCSECOND)  # as in a scenario
     assert units.error_state_unit("attitude x", "rad") == ("°", units.DEGREE)
+    assert units.error_state_unit(units.error_state_name("gyro scale", "xy", "rad"), "rad")[0] == "mrad"
 
 
 # ---------------------------------------------------------------------------------------------------- a recording of a hand
