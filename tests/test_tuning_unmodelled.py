@@ -54,6 +54,8 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         assert np.all(np.abs(size.estimate - 1e-3) < 4.0 * size.standard_error)
         assert np.all(size.standard_error[:2] < 4e-4)
         assert any("scale factor of the gyro" in words for words in unmodelled.words)
+        said = dataclasses.replace(examined, remarks=unmodelled.remarks).words
+        assert [words.count("does not model the gyro's scale factor of 1000 ppm") for words in said].count(1) == 1
         notes = {parameter.name: parameter.note for parameter in examined.parameters}
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")

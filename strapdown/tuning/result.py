@@ -161,7 +161,7 @@ class Tuning(Listed):
         """Sentences on what the parameters do not say: the remarks, the gate, errors that the filter does not model."""
         worst = max(self.unmodelled, key=lambda check: check.severity, default=None)
         gate = () if self.gate is None else (self.gate.words,)
-        return (*self.remarks, *gate, *(() if worst is None else worst.words))
+        return tuple(dict.fromkeys((*self.remarks, *gate, *(() if worst is None else worst.words))))
 
     @property
     def tables(self) -> list[Table]:

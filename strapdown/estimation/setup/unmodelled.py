@@ -12,6 +12,7 @@ from strapdown.checks import Hint
 from strapdown.estimation.filters import MEKF
 from strapdown.gyro import GyroSpec
 from strapdown.records import Origin
+from strapdown.results import figure
 
 if TYPE_CHECKING:
     from strapdown.estimation.setup.filter_setup import FilterSetup
@@ -100,7 +101,7 @@ def specified_errors(origin: Origin) -> list[SpecifiedError]:
     saturation, curve = (
         ("", 0.0) if origin.scenario is None else (origin.scenario.saturation, origin.scenario.temperature_curve)
     )
-    bent = f"the curve of the gyro's bias over temperature, up to {curve / units.DEGREE_PER_HOUR:.3g} °/h from a line"
+    bent = f"the curve of the gyro's bias over temperature, up to {figure(curve / units.DEGREE_PER_HOUR, 3)} °/h from a line"
     terms = [
         *_of_gyro(origin.gyro, gravity_f),
         (bool(saturation), SpecifiedError("gyro", "saturation", saturation)),
@@ -117,16 +118,16 @@ def _of_gyro(spec: GyroSpec, gravity_f: Sequence[float]) -> list[tuple[Any, Spec
         float(np.max(np.abs(getattr(spec, name))))
         for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability", "rate_ramp")
     )
-    drift = f" of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias"
+    drift = f" of {figure(flicker / units.DEGREE_PER_HOUR, 3)} °/h, covered in the attitude but not in the bias"
     terms: list[tuple[Any, str, str, str, bool]] = [
-        (scale, "scale factor", f" of {scale / 1e-6:.3g} ppm", "gyro.scale", True),
-        (asymmetry, "asymmetry", f" of {asymmetry / 1e-6:.3g} ppm", "", True),
-        (misalignment, "misalignment", f" of {misalignment / 1e-3:.3g} mrad", "gyro.misalignment", True),
+        (scale, "scale factor", f" of {figure(scale / 1e-6, 3)} ppm", "gyro.scale", True),
+        (asymmetry, "asymmetry", f" of {figure(asymmetry / 1e-6, 3)} ppm", "", True),
+        (misalignment, "misalignment", f" of {figure(misalignment / 1e-3, 3)} mrad", "gyro.misalignment", True),
         (flicker, "flicker", drift, "gyro.drift", True),
         (np.any(gravity_f) * spec.g_sensitivity, "sensitivity to acceleration", "", "gyro.force", True),
         (spec.temperature is not None, "bias over temperature", "", "gyro.temperature", False),
         (np.max(spec.quantization) + np.max(spec.rate_resolution), "quantisation", "", "", False),
-        (ramp, "rate ramp", f" of {ramp * 3600.0 / units.DEGREE_PER_HOUR:.3g} °/h²", "", True),
+        (ramp, "rate ramp", f" of {figure(ramp * 3600.0 / units.DEGREE_PER_HOUR, 3)} °/h²", "", True),
         (spec.timestamp_error + spec.sampling_jitter, "irregular sampling or time stamps", "", "", False),
         (spec.drop_probability, "lost samples", f", {100.0 * spec.drop_probability:.3g} % of all", "", False),
     ]
