@@ -1388,6 +1388,27 @@ def test_an_accelerometer_that_errs_slowly_has_a_less_certain_tilt(smooth):
     assert 0.1 < min(ratios) < max(ratios) < 0.8, ratios
 
 
+@pytest.mark.parametrize("live", [False, True])
+def test_the_rotation_over_a_gap_is_as_uncertain_in_a_slow_motion(live):
+    """The factors on σ, below 1 in motion slower than modelled, are of what was known before; live the gap is more uncertain."""
+    time = np.delete(np.arange(25 * RATE) / RATE, slice(int(20.0 * RATE), int(20.3 * RATE)))
+    turning = functools.partial(path, turns=((1.0, 2.6), (0.6, 3.7), (0.8, 2.1)))
+    field, noise = [0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)], [0.01, 0.1, 0.5]
+    cut = by_sensors("gap", time, turning(time), rates(time, turning), field=field, noise=noise, seed=1)
+    result = ahrs.estimate(cut, latency=0.0, full_covariance=True)
+    k, attitude, P = int(20.0 * RATE), result.estimate.attitude, result.estimate.covariance[:, :3, :3]
+    if live:
+        imu, rows = sd.LiveAhrs(interval=1.0 / RATE, magnetometer=True, latency=0.0), []
+        for sample in zip(time[: k + 1], cut.rate, cut.specific_force, cut.magnetic_field, strict=False):
+            imu.update(*sample)
+            rows.append((imu.attitude, imu.covariance[:3, :3]))
+        attitude, P = map(np.array, zip(*rows, strict=True))
+    R = quaternion.to_matrix(attitude)
+    before, after = (np.diagonal(R[row] @ P[row] @ R[row].T) for row in (k - 1, k))
+    gained = (after - before) / result.faults.turn_variance[k - 1].max()
+    assert 0.75 < gained.min() < gained.max() < 1.5, gained
+
+
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
     held = [estimated(file, False).innovations["accelerometer"] for file in sorted(broad.glob("*.hdf5"))]

@@ -356,7 +356,9 @@ def _at_stamps(
         force = first_vector(used.specific_force, prepared.turned, used.source, "accelerometer")
         field = first_vector(used.magnetic_field, prepared.turned, used.source, "magnetometer")
         iron[0] = headings.first_variance(force, field, parameters)
-    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, *scales, iron)
+    turned = np.zeros(len(edge)) if options.smooth else uncertain_turns(prepared.turn_variance).max(axis=1)
+    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, *scales, iron, turned)
+    limits = regions.limits(parameters, delays.sigma, magnetometer=prepared.field is not None)
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),
         recording_steps.Stamps(
@@ -366,7 +368,8 @@ def _at_stamps(
             late=delays.gyro,
             ahead=read_only(ahead),
         ),
-        regions.limits(parameters, delays.sigma, magnetometer=prepared.field is not None),
+        limits,
+        np.array([limits.tilt, limits.heading]),
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))

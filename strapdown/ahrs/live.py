@@ -189,9 +189,13 @@ class LiveAhrs:
         parameters, a, r = self.parameters, imu.arrays, read_only
         of_force, of_field = map(regions.averages, (max(parameters.step, self.interval), parameters.heading_interval))
         scales = regions.scales_of(parameters, magnetometer=self.magnetometer)
+        limits = regions.limits(parameters, delay_sigma, magnetometer=self.magnetometer)
+        a.known_before[:] = limits.tilt, limits.heading
         of_heading = a.field_density if self.magnetometer else a.force_density
         estimate = imu.attitude, imu.bias, imu.variance, imu.covariance
-        at_step = Steps(np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance)))
+        at_step = Steps(
+            np.zeros(1, np.int64), *map(r, (*estimate, a.tilt, a.heading, a.iron_variance, a.turned_by_gap))
+        )
         stamps = Stamps(r(a.times), r(a.rates), r(a.turns), imu.late, r(a.ahead))
         of_step = a.field_total, a.field_number, a.length, a.middle, a.total, a.number, a.end, a.now, a.turn_variance
         heading = a.heading_direction, a.heading_sigma, a.usual_field, a.subtracted_iron, a.heading_iron_variance
@@ -212,7 +216,8 @@ class LiveAhrs:
             carry=(
                 at_step,
                 stamps,
-                regions.limits(parameters, delay_sigma, magnetometer=self.magnetometer),
+                limits,
+                a.known_before,
                 self._at_sample,
             ),
             average_field=(r(a.field), r(a.frame), a.edge, a.field_total, a.field_number),

@@ -107,7 +107,7 @@ def imu_of(f: Any, local: Callable[..., Any], passing: Callable[..., Any]) -> Im
     ``local`` returns an array by name and shape that lasts for a step; ``passing`` one like one of Python that lasts for a function.
     """
     n, r, imu = f.program.n, f.program.recording, f.program.recording.imu
-    carried = imu.routines.carry.arguments[3]
+    carried = imu.routines.carry.arguments[-1]
     arrays = imu.arrays._asdict()
     own = {_key(array): getattr(f, name) for name, array in r.lasting.items()}
     own |= {_key(arrays[name]): local(name, arrays[name].shape) for name in LOCAL}
@@ -158,7 +158,9 @@ def init(f: Any) -> Any:
     f.count[0] = f.count[1] = 0
     for i, value in enumerate(starting.alignment_memory(unknown=False).tolist()):
         f.alignment[i] = value
-    f.aligned_variance[0] = f.over_gap[0] = 0.0
+    f.aligned_variance[0] = f.over_gap[0] = f.turned_by_gap[0] = 0.0
+    for i, value in enumerate(r.imu.arrays.known_before.tolist()):
+        f.known_before[i] = value
     f.rate_change[0] = live_imu.FIRST_RATE_CHANGE
     judged = [(f.force_density, f.force_averages, r.imu.arrays.force_averages)]
     if r.imu.magnetometer:
@@ -311,7 +313,7 @@ def end_step(imu: Any) -> None:
 def carry_to_sample(imu: Any) -> None:
     """Propagate the estimate to the last sample."""
     live_imu.carry_to_sample(imu)
-    f, carried = imu.filter, imu.routines.carry.arguments[3]
+    f, carried = imu.filter, imu.routines.carry.arguments[-1]
     for i in range(4):
         f.q[i] = carried.attitude[1, i]
     for i in range(6):

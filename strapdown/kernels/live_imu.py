@@ -61,6 +61,8 @@ LASTING = {
     "force_averages": ((5,), "", "its averages and sums"),
     "tilt": ((1,), "", "factor on sigma of the tilt"),
     "heading": ((1,), "", "factor on sigma of the heading"),
+    "turned_by_gap": ((1,), "", "1 if the rotation after this step is uncertain"),
+    "known_before": ((2,), "", "variances of tilt and heading before such a rotation, rad^2"),
     "iron_variance": ((1,), "", "variance that is added to that of the heading, rad^2"),
     "field": ((MOST, 3), "", "field at the samples of this step"),
     "field_innovation": ((1, 1), "", "last innovation of the heading over its sigma"),
@@ -265,6 +267,9 @@ def take_sample(imu):
         if a.over_gap[0] > 0.0:
             if a.over_gap[0] > LARGE_TURN * LARGE_TURN:
                 forget_attitude(imu)
+            a.turned_by_gap[0] = 1.0
+            carry_to_sample(imu)  # remembers what is known before
+            a.turned_by_gap[0] = 0.0
             add_turn_variance(imu)
             show_filter(imu)
             a.over_gap[0] = 0.0

@@ -153,6 +153,8 @@ class Steps(NamedTuple):
     """Factor (k,) on the σ of the rotation about the vertical."""
     iron: np.ndarray
     """Variance (k,) of that rotation in addition, rad²."""
+    turned: np.ndarray
+    """1 if a rotation after the step is uncertain, as over a gap (k,)."""
 
 
 class Stamps(NamedTuple):
@@ -191,7 +193,7 @@ class Limits(NamedTuple):
     """Variance of the timing error, along the rate, s²."""
     tilt: float
     heading: float
-    """Variances, rad², up to which the factors apply."""
+    """Variances, rad², up to which the factors apply (:func:`known_before`)."""
     accelerometer: float
     """Variance of the tilt by the accelerometer's own error, rad², in addition."""
     bias: float
@@ -209,17 +211,33 @@ def limited(factor, variance, limit):
     return math.sqrt(1.0 + (factor * factor - 1.0) * min(limit / variance, 1.0))
 
 
-def level_factors(factor, xx, xy, yy, limit):
+def known_before(memory, row, factor, variance, limit, turned):
+    """Return the variance up to which a factor applies: the limit, after an uncertain rotation that before it if the factor is below 1.
+
+    Until the filter knows as much again, the excess is of that rotation. ``memory``: that variance by row.
+    """
+    if turned > 0.0:
+        memory[row] = min(memory[row], variance)
+    elif variance <= memory[row]:
+        memory[row] = limit
+    return memory[row] if factor < 1.0 else limit
+
+
+def level_factors(factor, xx, xy, yy, limit, turned, memory):
     """Return the symmetric matrix (xx, xy, yy) by which the tilt is scaled: :func:`limited` along the principal axes of its covariance."""
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     apart = math.sqrt(half * half + xy * xy)
+    limit = known_before(memory, 0, factor, mean + apart, limit, turned)
     most, least = limited(factor, mean + apart, limit), limited(factor, max(mean - apart, 1e-30), limit)
     middle, slope = 0.5 * (most + least), 0.5 * (most - least) / max(apart, 1e-300)
     return middle + slope * half, slope * xy, middle - slope * half
 
 
-def carry_to_stamps(steps, stamps, limits, out):
-    """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay."""
+def carry_to_stamps(steps, stamps, limits, memory, out):
+    """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay.
+
+    ``memory`` (2,): of :func:`known_before`, for tilt and heading.
+    """
     for k in range(len(steps.edge)):
         first = steps.edge[k]
         last = steps.edge[k + 1] if k + 1 < len(steps.edge) else len(stamps.time)
@@ -230,11 +248,12 @@ def carry_to_stamps(steps, stamps, limits, out):
         P = steps.covariance[k]
         R = rotation_matrix(begin)
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
-        sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt)
+        sx, sm, sy = level_factors(steps.tilt[k], xx, xy, yy, limits.tilt, steps.turned[k], memory)
         if limits.bias > 0.0:  # nothing but the gyro shows the heading, whose error is mainly that of the bias
             h = b = max(steps.heading[k], limited(limits.unshown, 3.0 * limits.bias, P[3, 3] + P[4, 4] + P[5, 5]))
         else:
-            h, b = limited(steps.heading[k], zz, limits.heading), 1.0
+            limit = known_before(memory, 1, steps.heading[k], zz, limits.heading, steps.turned[k])
+            h, b = limited(steps.heading[k], zz, limit), 1.0
         floor, iron = limits.accelerometer, steps.iron[k]
         x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
         level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
