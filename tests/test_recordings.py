@@ -288,12 +288,12 @@ def test_a_sensor_of_zeros_is_reported(csv, columns, name):
     read(csv(f"time,gx [rad/s],gy,gz,{columns}", [f"{k / 100},0.1,0.2,0.3,,," for k in range(3)]))
 
 
-@pytest.mark.parametrize("bad", ["nan", "", " "])
+@pytest.mark.parametrize("bad", ["nan", "", " ", "zeros"])
 def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     """What the turn across them is nobody knows: the intervals beside one are joined, and a filter's covariance grows over all of it."""
     rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(8)]
     for k in (0, 3, 4):
-        rows[k] = f"{0.01 * k:.2f},{0.1 * k},{bad},0,{k},2,9"
+        rows[k] = f"{0.01 * k:.2f}" + (",0" * 6 if bad == "zeros" else f",{0.1 * k},{bad},0,{k},2,9")
     recording = read(csv(rows=rows))
     np.testing.assert_array_equal(recording.time, [0.01, 0.02, 0.05, 0.06, 0.07])
     np.testing.assert_allclose(recording.specific_force[:, 0], [1, 2, 5, 6, 7])

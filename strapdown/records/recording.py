@@ -79,8 +79,8 @@ class Recording(Listed):
     epoch_ns : int, default 0
         Reading of the source's clock at time 0, ns; nanoseconds since 1970 for a clock that counts from then.
     missing_gyro : ndarray (k,), default empty
-        Stamps of rows without a gyro sample, s. These rows are left out (:func:`with_gyro`): the intervals on both sides are joined, the
-        rotation is computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
+        Stamps of rows without a gyro sample, or of zeros, s. These rows are left out (:func:`with_gyro`): the intervals on both sides are
+        joined, the rotation is computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
     repeated : ndarray (k,), default empty
         Stamps of rows that repeat the stamp of the row before and add no sensor's sample, s; they are left out. If the share of those with
         other samples is above :data:`FEW_REPEATED`, the file is rejected.
@@ -215,7 +215,7 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
     row with it that lacks them.
     """
     not_back(f"{source}: time", time)  # before rows are left out
-    columns |= {"time": time, "rate": rate}
+    columns = _without_zeros(columns | {"time": time, "rate": rate})
     if (np.diff(time) == 0.0).any():
         columns = _one_row_a_stamp(source, columns)
     known = np.asarray(~np.isnan(columns["rate"]).any(axis=1))
@@ -236,6 +236,21 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
                     )
         columns = _rows(columns, known) | moved | {"missing_gyro": stamps[~known], "remarks": remarks}
     return Recording(source=source, **columns)
+
+
+def _without_zeros(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns with NaN in rows in which gyro and vectors are zero, as some loggers write for lost packets.
+
+    If most are, the accelerometer is not connected.
+    """
+    vectors = {name: columns[name] for name in SENSORS.values() if columns.get(name) is not None}
+    zero = ~vectors["rate"].any(axis=1)
+    if len(vectors) == 1 or not zero.any():
+        return columns
+    zero &= ~np.hstack(list(vectors.values())).any(axis=1)
+    if np.mean(zero) > 0.5:
+        return columns
+    return columns | {name: np.where(zero[:, None], np.nan, values) for name, values in vectors.items()}
 
 
 def _one_row_a_stamp(source: str, columns: dict[str, Any]) -> dict[str, Any]:
