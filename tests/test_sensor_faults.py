@@ -270,27 +270,30 @@ def test_a_truncated_gyro_shows_the_same_bias_at_rest_and_in_motion():
     assert np.abs(np.mean((truncated.rate - rate)[resting], axis=0)).max() > 0.3 * LSB
 
 
-def filled(plain: Recording, *spans: tuple[float, float]) -> Recording:
-    """The recording with straight lines from begin to end of each span, s, in every sensor."""
+def filled(plain: Recording, *spans: tuple[float, float], held: bool = False) -> Recording:
+    """The recording with straight lines from begin to end of each span, s, in every sensor, or with its first sample held."""
     samples = {name: getattr(plain, name).copy() for name in ("rate", "specific_force", "magnetic_field")}
     for begin, end in spans:
         first, last = round(begin * RATE), round(end * RATE)
         u = np.linspace(0.0, 1.0, last - first + 1)[:, None]
         for values in samples.values():
-            values[first : last + 1] = (1.0 - u) * values[first] + u * values[last]
+            values[first : last + 1] = np.where(
+                held & (u < 1.0), values[first], (1.0 - u) * values[first] + u * values[last]
+            )
     return dataclasses.replace(plain, **samples)
 
 
+@pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("smooth", [False, True])
-def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
-    """Neither its samples count nor its steady rate as rest."""
+def test_a_gap_filled_by_interpolation_is_a_gap(smooth, held):
+    """Neither its samples count nor its steady rate as rest; as if the last sample before it was repeated."""
     spans = ((10.0, 10.2), (20.0, 20.4), (38.0, 39.9))
     plain = swing()
-    broken = filled(plain, *spans)
+    broken = filled(plain, *spans, held=held)
     rows = np.rint(RATE * np.array(spans)).astype(int)
     assert interpolated(broken.rate) == [tuple(span) for span in rows.tolist()]
     _, nees, ahrs_estimate = off_by(broken, smooth=smooth)
-    assert "Gaps filled by interpolation: 3, up to 1.9 s" in ahrs_estimate.faults.words[0]
+    assert "Gaps filled by interpolation or repeated samples: 3, up to 1.9 s" in ahrs_estimate.faults.words[0]
     gap = np.concatenate([np.arange(first + 1, last) for first, last in rows])
     lead = round(sensor_faults.LEAD * RATE)
     left_out = np.concatenate([np.arange(first + 1 - lead, last) for first, last in rows])
@@ -315,6 +318,7 @@ def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():
     assert interpolated(level) == []
     assert interpolated(np.random.default_rng(1).normal(0.0, 1e-3, (5000, 3))) == []
     assert interpolated(np.zeros((5, 3))) == []
+    assert interpolated(np.repeat(np.random.default_rng(1).normal(0.0, 2.0, (100, 3)), 20, axis=0)) == []  # a slow gyro
 
 
 def test_a_gyro_sampled_too_slowly_is_reported_with_its_error():

@@ -11,8 +11,8 @@ A damaged sample is left out: a specific force beyond 16 g or a field far above 
 of the gyro is replaced, if only one in a row is damaged (:func:`damaged_rates`). At rest and in the hand such a specific force turned the
 attitude by up to 13°, a rate of 50 rad/s by up to 60°.
 
-Where a recording was resampled, a gap of its sensors can be filled by a straight line, which is no measurement: the rotation over it is as
-uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
+Where a recording was resampled, a gap of its sensors can be filled by a straight line or by the last sample, which is no measurement: the
+rotation over it is as uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ MIN_STRAIGHT = 10
 """Minimum number of successive gyro samples on one straight line to be treated as interpolated."""
 STRAIGHT = 1e-4
 """Maximum second difference of such samples, relative to the median one of the recording."""
+MIN_JUMP = 0.2
+"""Minimum rate of held samples, and its change at their end, rad/s, to be treated as the last sample before a gap, repeated."""
 LEAD = 0.05
 """Time before such a gap whose samples are left out too, s, so that no step of the filter has some from before an unknown rotation."""
 LAGS, SHARES = 16, 64
@@ -122,7 +124,9 @@ def find(recording: Recording) -> Faults:
     if filled:
         durations = np.array([recording.time[last] - recording.time[first] for first, last in filled])
         turns = np.minimum(turn_variance_over(rate, durations, usual), UNKNOWN_TURN)
+        changes["rate"] = rate = rate.copy()
         for (first, last), turn in zip(filled, turns, strict=True):
+            rate[first : last + 1] = np.linspace(rate[first], rate[last], last - first + 1)  # held ones too
             variance[first] += turn
             variance[last - 1] += 0.5 * turn  # so that what is after the gap shows nothing of what is within
         lead = round(LEAD / usual)
@@ -133,7 +137,8 @@ def find(recording: Recording) -> Faults:
                 changes[name] = samples.copy()
                 changes[name][inside] = np.nan
         words.append(
-            f"Gaps filled by interpolation: {len(filled)}, up to {durations.max():.3g} s; samples there are ignored, and σ grows over each"
+            f"Gaps filled by interpolation or repeated samples: {len(filled)}, up to {durations.max():.3g} s; samples there are ignored, "
+            "and σ grows over each"
         )
     long = np.flatnonzero(steps > LONG_INTERVAL * usual)
     if len(long):
@@ -200,16 +205,26 @@ def second_differences(rate: Array) -> Array:
 
 
 def interpolated(rate: Array, bend: Array) -> list[tuple[int, int]]:
-    """Return first and last sample of each run of at least :data:`MIN_STRAIGHT` rates (n, 3) on a straight line that is not level.
+    """Return first and last sample of each run of at least :data:`MIN_STRAIGHT` rates (n, 3) on a straight line that noise never draws.
 
-    Noise never draws such a line; held samples of a gyro at rest are level. ``bend``: their :func:`second_differences`.
+    Held samples of a gyro at rest or that turns steadily are on a level line; they fill a gap only if a fast rate jumps at their end, and
+    not if most fast samples are held, as of a slow sensor. ``bend``: their :func:`second_differences`.
     """
     most = bend.max(initial=0.0)
     if most == 0.0 or not _runs(bend <= STRAIGHT * most):  # saves the median of nearly every recording
         return []
     usual = median(bend[bend > 0.0])
     runs = _runs(bend <= STRAIGHT * usual)
-    return [(first, last) for first, last in runs if np.max(np.abs(rate[last] - rate[first])) > usual]
+    filled, held = [], []
+    for first, last in runs:
+        change, jump = (np.max(np.abs(rate[row] - rate[last])) for row in (first, min(last + 1, len(rate) - 1)))
+        if change > usual:
+            filled.append((first, last))
+        elif jump > MIN_JUMP and np.max(np.abs(rate[last])) > MIN_JUMP:
+            held.append((first, min(last + 1, len(rate) - 1)))  # the rotation to the next sample is unknown too
+    fast = np.count_nonzero(np.abs(rate).max(axis=1) > MIN_JUMP)
+    rare = 2 * sum(last - first for first, last in held) < fast
+    return sorted(filled + held) if rare else filled
 
 
 def _runs(straight: np.ndarray) -> list[tuple[int, int]]:
