@@ -10,6 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+import strapdown as sd
 from strapdown import ahrs, quaternion
 from strapdown.ahrs import check_conventions, estimating
 from strapdown.kernels import recording_samples
@@ -445,6 +446,16 @@ def test_a_stuck_gyro_is_reported(rows, axes, value, words):
         assert examined.verdict == "cannot tell"
     at_rest = dataclasses.replace(recording, specific_force=rng.normal([0.0, 0.0, 9.8], 0.01, (1000, 3)))
     assert bool(sensor_faults.stuck_words(at_rest)) == (axes == 1 and words != "")
+
+
+def test_samples_stamped_when_their_packet_arrived_are_reported():
+    """Ten samples in a packet; a recording that pauses for 9 s of every 10 s is none."""
+    plain, k = swing(), np.arange(len(swing().time))
+    arrived = dataclasses.replace(plain, time=(k // 10 * 10 + 9) / RATE + k % 10 * 1e-4)
+    with pytest.warns(ahrs.ConventionWarning, match="the samples come in bursts"):
+        sd.estimate(arrived)
+    assert check_conventions.examine(arrived).reason == "the samples come in bursts; see the warning"
+    assert sensor_faults.burst_words(dataclasses.replace(plain, time=k / RATE + 9.0 * (k // RATE))) == []
 
 
 @pytest.mark.parametrize("sensor", ["accelerometer", "magnetometer"])

@@ -252,8 +252,8 @@ def _examined(recording: Recording) -> Examination:
         if vectors is not None
     }
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
-    stuck = sensor_faults.stuck_words(recording)
-    doubts += _too_fast(recording) + stuck
+    stuck, bursts = sensor_faults.stuck_words(recording), sensor_faults.burst_words(recording)
+    doubts += _too_fast(recording) + stuck + bursts
     unsaid = [f"as it seems, {change}" for change in unit_changes]  # gravity alone shows it, whatever the turns
     upright = at_rest(recording)
     explained = _without_reference if recording.true_attitude is None else _with_reference
@@ -264,8 +264,9 @@ def _examined(recording: Recording) -> Examination:
         result = Examination(source=recording.source, verdict="cannot tell", reason=reason, candidates=(), notes=notes)
     else:
         result = _concluded(recording.source, explanations, unit_changes, notes)
-        if stuck:
-            result = replace(result, verdict="cannot tell", reason="a sensor is stuck; see the warning", notes=notes)
+        if stuck or bursts:
+            reason = f"{'a sensor is stuck' if stuck else 'the samples come in bursts'}; see the warning"
+            result = replace(result, verdict="cannot tell", reason=reason, notes=notes)
         elif not doubts and (doubts := _without_gravity(result.candidates[0], sensors.get("accelerometer"))):
             result = replace(result, verdict="cannot tell", reason="the accelerometer shows no gravity", notes=notes)
             unsaid = []

@@ -26,7 +26,7 @@ from strapdown.checks import Array, lengths, median
 from strapdown.kernels import recording_samples as kernel
 from strapdown.kernels.alignment import UNKNOWN_TURN
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import LARGEST_FORCE, SENSORS, Recording, corrected
+from strapdown.records.recording import GAP, LARGEST_FORCE, SENSORS, Recording, corrected
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
@@ -343,6 +343,23 @@ def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
     share = (np.arange(SHARES) + 0.5) / SHARES
     inner = np.interp(np.multiply.outer(length, share), time, square) @ share / SHARES
     return np.asarray(length**2 * np.maximum(inner - 0.25 * np.interp(length, time, square), 0.0))
+
+
+MIN_BURSTS = 0.015
+"""Minimum share of long intervals between stamps that come in bursts; of a recording with gaps it is smaller."""
+
+
+def burst_words(recording: Recording) -> list[str]:
+    """Return a warning if most of the time is in long intervals between bursts of samples, as of packets stamped at their arrival."""
+    steps = np.diff(recording.time)
+    long = steps > GAP * recording.interval
+    lasts = steps.sum()
+    if np.mean(long) < MIN_BURSTS or np.sum(steps[long]) < 0.5 * lasts:
+        return []
+    return [
+        f"the samples come in bursts, {np.count_nonzero(long)} long intervals between stamps take {np.sum(steps[long]) / lasts:.0%} of the "
+        "time: stamps of packets that arrived, not of samples; the attitude is wrong unless the samples are spaced evenly"
+    ]
 
 
 STUCK_TIME = 2.0
