@@ -137,7 +137,8 @@ def test_a_field_in_arbitrary_units_declares_none(table, unit):
     assert recording.magnetic_unit == ""
     plain = unit.strip("()")
     units = f"ms\tdeg/s\tdeg/s\tdeg/s\tm/(s^2)\tm/(s^2)\tm/(s^2)\t{plain}\t{plain}\t{plain}\t"
-    recording = read(table("time\tgx\tgy\tgz\tax\tay\taz\tmx\tmy\tmz\t", units, separator="\t"))
+    names = (f"Shimmer_{sensor}_{axis}_CAL" for sensor in ("Gyro", "Accel_LN", "Mag") for axis in "XYZ")
+    recording = read(table("\t".join(("Shimmer_Timestamp_Unix_CAL", *names, "")), units, separator="\t"))
     np.testing.assert_array_equal(recording.specific_force, VALUES[:, 4:7])
     assert recording.magnetic_unit == ""
 

@@ -324,7 +324,7 @@ def _axis(group: str, name: str, *, is_known: bool) -> tuple[tuple[str, ...], in
     if not places:
         return None
     place = places[-1]
-    before, after = words[:place], words[place + 1 :]
+    before, after = words[:place], [word for word in words[place + 1 :] if word != "cal"]  # of Shimmer: calibrated
     unit = unit_of(group, "".join(after)) if after else ""
     if after and not unit:
         return None
