@@ -1409,6 +1409,20 @@ def test_the_rotation_over_a_gap_is_as_uncertain_in_a_slow_motion(live):
     assert 0.75 < gained.min() < gained.max() < 1.5, gained
 
 
+def test_where_the_tilt_is_unknown_so_is_the_heading():
+    """The field's heading is about the vertical: with a vertical that errs by 30° it errs by 90°."""
+    plain = recording(60.0, noise=1.0)
+    phase = 2.0 * np.pi * plain.time / 20.0
+    slow = 5.0 * np.column_stack([np.cos(phase), np.sin(phase), 0.0 * phase])
+    force = plain.specific_force + quaternion.rotate(quaternion.conjugate(plain.true_attitude), slow)
+    result = ahrs.estimate(dataclasses.replace(plain, specific_force=force), full_covariance=True).estimate
+    R = quaternion.to_matrix(result.attitude)
+    variance = np.einsum("nij,njk,nik->ni", R, result.covariance[:, :3, :3], R)[4000:]
+    error = reference_errors(result.attitude, plain.true_attitude).heading[4000:]
+    assert np.sqrt(np.mean(error**2)) > 1.0
+    assert np.mean(error**2 < 3.84 * variance[:, 2]) > 0.9
+
+
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
     held = [estimated(file, False).innovations["accelerometer"] for file in sorted(broad.glob("*.hdf5"))]

@@ -202,6 +202,10 @@ class Limits(NamedTuple):
     """Least factor on σ of heading and bias without a field; it applies by the share of that variance that is left."""
 
 
+KNOWN_TILT = 0.25
+"""Variance of the tilt, rad², half a radian squared, whose excess is added to that of the heading, which is measured about the vertical."""
+
+
 def limited(factor, variance, limit):
     """Return the factor on σ if one is to apply to the variance up to a limit only, and not to what exceeds it.
 
@@ -257,8 +261,9 @@ def carry_to_stamps(steps, stamps, limits, memory, out):
         floor, iron = limits.accelerometer, steps.iron[k]
         x, y = (sx * xx + sm * xy, sx * xy + sm * yy), (sm * xx + sy * xy, sm * xy + sy * yy)
         level = (x[0] * sx + x[1] * sm + floor, x[0] * sm + x[1] * sy, y[0] * sm + y[1] * sy + floor)
+        unknown = max(0.5 * (level[0] + level[2]) - KNOWN_TILT, 0.0)
         beside = (h * (sx * xz + sm * yz), h * (sm * xz + sy * yz))
-        fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz + iron))
+        fixed = full((level[0], level[1], beside[0], level[2], beside[1], h * h * zz + iron + unknown))
         across = multiply(R, block_at(P, 3))
         first_row, second_row = across[:3], across[3:6]
         level_rows = combine(b * sx, first_row, b * sm, second_row) + combine(b * sm, first_row, b * sy, second_row)
