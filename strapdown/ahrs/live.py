@@ -64,7 +64,7 @@ class LiveAhrs:
     sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps, damaged rates). The last row
     differs too, because the end of a recording ends a step of the filter. Samples before the first complete one are not used, nor a damaged
     specific force or field: more than 16 g on an axis, or six times the usual field, for a moment, unless that comes again within ten
-    seconds. A damaged rate turns the attitude; omit such a sample.
+    seconds. A damaged rate turns the attitude, and so do zeros or repeated samples in place of lost ones; omit such samples.
 
     Over a gap the rotation is as uncertain as the rate of the seconds before changes; after one of more than half a second the attitude is
     treated as unknown, and is aligned again by the next samples. ``estimate`` knows the change of the rate from the whole recording.
