@@ -208,7 +208,7 @@ def interpolated(rate: Array, bend: Array) -> list[tuple[int, int]]:
     """Return first and last sample of each run of at least :data:`MIN_STRAIGHT` rates (n, 3) on a straight line that noise never draws.
 
     Held samples of a gyro at rest or that turns steadily are on a level line; they fill a gap only if a fast rate jumps at their end, and
-    not if most fast samples are held, as of a slow sensor. ``bend``: their :func:`second_differences`.
+    not if most fast samples repeat the one before, as of a slow sensor. ``bend``: their :func:`second_differences`.
     """
     most = bend.max(initial=0.0)
     if most == 0.0 or not _runs(bend <= STRAIGHT * most):  # saves the median of nearly every recording
@@ -222,9 +222,10 @@ def interpolated(rate: Array, bend: Array) -> list[tuple[int, int]]:
             filled.append((first, last))
         elif jump > MIN_JUMP and np.max(np.abs(rate[last])) > MIN_JUMP:
             held.append((first, min(last + 1, len(rate) - 1)))  # the rotation to the next sample is unknown too
-    fast = np.count_nonzero(np.abs(rate).max(axis=1) > MIN_JUMP)
-    rare = 2 * sum(last - first for first, last in held) < fast
-    return sorted(filled + held) if rare else filled
+    if not held:
+        return filled
+    repeated = np.all(rate[1:] == rate[:-1], axis=1)[np.abs(rate[1:]).max(axis=1) > MIN_JUMP]
+    return filled if np.mean(repeated) > 0.5 else sorted(filled + held)
 
 
 def _runs(straight: np.ndarray) -> list[tuple[int, int]]:
