@@ -363,6 +363,17 @@ def test_variances_are_those_of_the_square_root(sigma, sharp, start_sigma, bound
         assert np.max(np.abs(error) / np.sqrt(expected[:, :6])) < bound
 
 
+def test_sub_steps_do_not_depend_on_the_reading_of_the_clock():
+    """Seconds since 1970 have seven digits behind the point; a sub-step of the second record is shorter than their last."""
+    for turn, passes in ((100.0, (estimation.run, estimation.smooth)), (1e5, (estimation.run,))):
+        record = ImuRecord(time=1.7e9 + 0.01 * np.arange(4.0), increments=np.full((3, 3), turn))
+        initial = initial_state(quaternion.IDENTITY, attitude_sigma=1e-2, bias_sigma=1e-9)
+        expected = quaternion.exp(turn * np.outer(np.arange(4.0), np.ones(3)))
+        for through in passes:
+            off = quaternion.angle_between(through(record, NOISE, initial).attitude, expected)
+            assert off.max() < 1e-10 * turn
+
+
 @pytest.mark.parametrize(("parts", "steps"), [(1, 100_000), pytest.param(500, 2_000_000, marks=pytest.mark.slow)])
 def test_positive_definite_and_steady_over_a_long_run(parts, steps):
     """1e5 steps, or 1e9 (five minutes): the covariance repeats itself period by period to rounding, and the quaternion keeps its norm."""

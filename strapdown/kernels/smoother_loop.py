@@ -111,6 +111,7 @@ def locate_edges(edges, event_time, segments, number, starts_out):
     e = 0
     k = 1
     now = edges[0]
+    ahead = 0.0
     starts_out[0] = 0
     for j in range(number):
         while e < len(event_time) and event_time[e] <= now:
@@ -119,7 +120,9 @@ def locate_edges(edges, event_time, segments, number, starts_out):
         if e < len(event_time) and event_time[e] < stop:
             stop = event_time[e]
         dt = segments[j, 0]
-        now = stop if dt == stop - now else now + dt
+        reached = dt == stop - now - ahead or ahead + dt == stop - now
+        ahead = 0.0 if reached else ahead + dt
+        now = stop if reached else now
         if now >= edges[k]:
             starts_out[k] = j + 1
             k += 1

@@ -83,6 +83,7 @@ def walk(edges, increments, measured, every, body, out):
     e = none
     k = -1  # the interval before the first edge has no duration; the measurements at the first edge belong to it
     now = edges[0]
+    ahead = 0.0  # duration of the sub-steps since: added to a time, it would be rounded to that time's digits
     end = now
     whole = 1.0
     theta = increment_over(increments, k, body)
@@ -92,7 +93,7 @@ def walk(edges, increments, measured, every, body, out):
     while k < len(increments) and not stopped(state):
         due = e < events and time[e] <= end
         stop = time[e] if due else end
-        dt = stop - now
+        dt = stop - now - ahead
         if dt > 0.0:
             part = theta
             # Usually a whole interval: a predicted branch costs less than a selection of values, which waits for both.
@@ -102,10 +103,11 @@ def walk(edges, increments, measured, every, body, out):
                 if longest < dt:
                     part = scale(longest / dt, part)
                     dt = longest
-                    stop = now + dt
+                    stop = now
                     due = False
             state = predict(state, part, dt, body, out)
-            now = stop
+        ahead = ahead + dt if stop == now else 0.0
+        now = stop
         if due:
             state = update(state, e, now, measured, body, out)
             e += 1
