@@ -280,6 +280,8 @@ def test_one_sigma_of_an_attitude_is_that_about_each_axis():
     each = 0.01 * np.arange(1.0, 6.0)
     varying = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": each})
     np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
+    again = vectors.VectorMeasurements(**ATTITUDES, sigma_axes=varying.sigma_axes)  # as it is read from a file
+    np.testing.assert_array_equal(again.sigma, each)
     np.testing.assert_allclose(varying.noise_scaled(3.0).sigma_axes[:, 1], 3.0 * each, rtol=1e-15)
     whole = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.0, "covariance": np.diag([1e-4, 4e-4, 9e-4])})
     np.testing.assert_allclose(whole.noise_scaled(3.0).covariance, 9.0 * whole.covariance, rtol=1e-15)

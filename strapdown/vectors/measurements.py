@@ -168,7 +168,8 @@ class VectorMeasurements(ByValue):
             if attitude:
                 columns["sigma_axes"] = axes
         if axes is not None:
-            mean = np.sqrt(np.mean(axes**2, axis=1))
+            # That of equal axes is theirs to the last bit, so that a series read from a file equals the one written.
+            mean = np.where(np.ptp(axes, axis=1) == 0.0, axes[:, 0], np.sqrt(np.mean(axes**2, axis=1)))
             if not attitude and has_sigma and not agrees(sigma, mean):
                 raise InputError(
                     f"{name}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
