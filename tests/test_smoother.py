@@ -461,6 +461,26 @@ def test_a_candidate_that_is_lost_from_its_start_is_left_behind() -> None:
         assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[last:]) < 5.0
 
 
+@pytest.mark.parametrize("which", [[(2, 1), (2, 0)], [(0, 2, 2), (0, 0, 0), (2, 0, 1)]])
+def test_a_recovery_with_the_measurements_at_the_last_edge(which) -> None:
+    """Sensors that contradict each other: the candidate that takes over is not the first, or refuses what is measured at its start."""
+    turns = quaternion.exp(np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.7, 0.0]]))
+    time = np.arange(float(len(which[0])))
+    series = tuple(
+        VectorMeasurements(sensor=f"s{i}", kind="attitude", time=time, attitude=turns[list(own)], sigma=0.01)
+        for i, own in enumerate(which)
+    )
+    record = ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=series)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.01, bias_sigma=1e-3)
+    smoothed, filtered = (
+        through(record, NOISE, initial, gate=Gate(recovery=2)) for through in (estimation.smooth, estimation.run)
+    )
+    assert recoveries(smoothed)[-1].end == time[-1]
+    assert np.all(np.isfinite(smoothed.variance))
+    np.testing.assert_allclose(smoothed.attitude[-1], filtered.attitude[-1], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(smoothed.variance[-1], filtered.variance[-1], rtol=1e-9)
+
+
 def test_memory_does_not_grow_with_the_number_of_recoveries() -> None:
     record, initial = simulated(dataclasses.replace(WELL_SEEN, duration=120.0), np.random.default_rng(1))
     peaks = []

@@ -180,7 +180,8 @@ def _smoothed(problem: Problem, options: Options, kind: type[_SixStates | _ManyS
 
     while recoveries := [event for event in passed.estimate.events if event.kind == "recovery"]:
         event = min(recoveries, key=lambda event: event.end)
-        memory = filtered(_part(problem, begin, event.end, problem.initial), replace(options, every=len(time))).end.gate
+        until = _part(problem, begin, event.end, problem.initial)
+        memory = filtered(until, replace(options, every=len(time))).end.gate
         assert memory is not None
         since = max(memory.counts[SINCE], begin)
         if since == begin and passed is not whole:  # another candidate than that with which this part starts
@@ -192,9 +193,13 @@ def _smoothed(problem: Problem, options: Options, kind: type[_SixStates | _ManyS
                 of_part, rows = _smoothed(part, options, kind)
                 state = of_part.end
                 write(part, rows)
-        if since == last:
+        if since == last:  # the filter's state there is left
+            rows = kind(problem).outputs(1, options)
+            kind(problem).go_back(whole.segments[-1:], np.zeros(1, np.int64), rows)
+            for out, row in zip(outputs, rows, strict=True):
+                out[-1:] = row
             return whole, outputs
-        problem = _part(problem, since, last, _candidate(problem, options, state, memory, since))
+        problem = _part(problem, since, last, _candidate(problem, options, state, memory, since), closed=True)
         begin, passed = since, filtered_whole(problem, options)
     rows = outputs if passed is whole else kind(problem).outputs(len(problem.record.time), options)
     kind(problem).go_back(passed.segments, segment_starts(problem, passed.segments), rows)
@@ -230,13 +235,17 @@ def segment_starts(problem: Problem, segments: Array) -> np.ndarray:
     return first
 
 
-def _part(problem: Problem, begin: float, end: float, initial: State) -> Problem:
-    """Return the part of a record between two times, with the measurements from ``begin`` on and before ``end``, or to the last edge."""
+def _part(problem: Problem, begin: float, end: float, initial: State, *, closed: bool = False) -> Problem:
+    """Return the part of a record between two times, with the measurements from ``begin`` on and before ``end``.
+
+    ``closed``: with those at the end too. Those with which a recovery ends belong to what comes after it, at the last edge too: in a part
+    with them it would recur for ever.
+    """
     record, model = problem.record, problem.model
     time = np.concatenate([[begin], record.time[(record.time > begin) & (record.time < end)], [end]])
     k = np.searchsorted(record.time, time[1:], side="left") - 1
     share = np.diff(time) / record.intervals[k]
-    before = np.nextafter(end, np.inf) if end == record.time[-1] else end
+    before = np.nextafter(end, np.inf) if closed else end
 
     def inside(at: Array) -> np.ndarray:
         return (at >= begin) & (at < before)
