@@ -236,7 +236,7 @@ def test_noise_and_reference_of_one_measurement(kind):
     other = LiveFilter(NOISE, start(), sensors=[measured_as(kind, 0.01, np.array([1.0, 0.0, 0.0]), z)])
     reference = None if kind == "attitude" else {"s": r}
     other.update(0.1, (0.0, 0.1, 0.0), s=z, sigma={"s": 0.03}, reference_f=reference)
-    assert apart(other.state(), exact.state()) < 1e-13
+    assert same(other.state(), exact.state())
     # The next one has the declared noise again.
     again = LiveFilter(NOISE, other.state(), sensors=[measured_as(kind, 0.01, np.array([1.0, 0.0, 0.0]), z)], time=0.1)
     for live in (other, again):

@@ -44,6 +44,7 @@ from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.walk import walk
 from strapdown.records import Event, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
+from strapdown.vectors.measurements import direction
 
 MAX_MEASUREMENTS = 64
 """Maximum number of measurements within one gyro interval."""
@@ -544,11 +545,8 @@ def _changed(series: VectorMeasurements, sigma: float | None, reference: ArrayLi
     """Return one measurement of a sensor with another σ or reference."""
     name, changes = series.sensor, dict[str, Any]()
     if reference is not None:
-        r = array(f"{name}: reference_f", reference, (3,))
-        if not r.any():
-            raise InputError(f"{name}: reference_f is {reference}; give a direction")
-        if series.kind != "vector":
-            r = r / np.linalg.norm(r / np.abs(r).max()) / np.abs(r).max()
+        unit = direction(f"{name}: reference_f", reference)
+        r = array(f"{name}: reference_f", reference, (3,)) if series.kind == "vector" else unit
         if series.kind == "heading":
             need_level(f"{name}: reference_f", r)
         changes["reference_f"] = r

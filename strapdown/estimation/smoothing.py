@@ -82,8 +82,8 @@ def smooth(
     Returns
     -------
     Estimate
-        Smoothed attitude, bias, error states and variances; at the last edge those of the filter. Innovations and events are the
-        filter's.
+        Smoothed attitude, bias, error states and variances; at the last edge those of the filter, unless its gate recovered shortly before:
+        the smoother starts again from the samples of the recovery. Innovations and events are the filter's.
 
     Notes
     -----
