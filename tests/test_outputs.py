@@ -64,6 +64,14 @@ def test_heading_is_from_north_towards_east(yaw, degrees):
     heading = outputs.heading(q[None], np.diag([1.0, 4.0, 9.0])[None])
     assert abs((np.degrees(heading.angles[0]) - degrees + 180.0) % 360.0 - 180.0) < 1e-9
     assert abs(heading.sigma[0] - 3.0) < 1e-12  # level: a turn about up alone moves it
+    estimate = sd.records.Estimate.from_arrays(
+        [0.0, 1.0], [q, q], np.tile(np.radians(np.diag([1.0, 4.0, 9.0])), (2, 1, 1))
+    )
+    notes = " ".join(replace(estimate, fixed_frame="East-North-Up, magnetic North").listing().notes)
+    sigma = np.degrees(3.0 * np.sqrt(np.radians(1.0)))
+    assert f" {degrees % 360.0:.2f}°, σ {sigma:.3g}°; of the z axis from the vertical: 0.00°" in notes.replace(
+        "360.00", "0.00"
+    )
 
 
 def test_heading_of_a_tilted_body_has_the_sigma_of_differences():

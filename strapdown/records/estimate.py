@@ -279,6 +279,15 @@ class Estimate(ByValue, Listed):
                 label, (word, size) = error_state_name(name, component, unit), state_unit(self, name, unit)
                 rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
+        if "East-North-Up" in self.fixed_frame:
+            P = None if self.covariance is None else self.covariance[-1:, :3, :3]
+            angles = outputs.heading(self.attitude[-1:], P)
+            sigma = "" if angles.sigma is None else f", σ {angles.sigma[0] / DEGREE:.3g}°"
+            tilt = float(np.arccos(np.clip(quaternion.to_matrix(self.attitude[-1])[2, 2], -1.0, 1.0)))
+            notes.append(
+                f"Heading of the body x axis at the end: {angles.angles[0] / DEGREE:.2f}°{sigma}; of the z axis from the vertical: "
+                f"{tilt / DEGREE:.2f}°"
+            )
         for sensor, innovations in self.innovations.items():
             used = innovations.used
             nis = "none used"
