@@ -219,7 +219,7 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     content = json.loads((tmp_path / "check.json").read_text())
     asymmetry = "the gyro's asymmetry of 2000 ppm"
     if known:
-        missing = ["the gyro's scale factor of 1e+03 ppm", asymmetry]
+        missing = ["the gyro's scale factor of 1000 ppm", asymmetry]
         assert f"the filter does not model {', '.join(missing)}" in " ".join(result.output.split())
         assert content["unmodelled"] == missing
     else:

@@ -166,7 +166,7 @@ def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, tmp_pat
     content = body(report.write(tmp_path / "scaled.h5").page)
     assert "<strong>Not consistent.</strong>" in content
     assert (
-        "; the filter does not model the gyro&#x27;s scale factor of 5e+04 ppm"
+        "; the filter does not model the gyro&#x27;s scale factor of 50000 ppm"
         in content[: content.index("<h2>Key numbers")]
     )
 
