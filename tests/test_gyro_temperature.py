@@ -196,6 +196,23 @@ def test_parts_of_a_record_and_a_gate_agree_with_the_whole(gate):
     assert (np.abs(slope.values[-1] - [3e-4, -2e-4, 1e-4]) < 4.0 * slope.sigma[-1]).all()
 
 
+def test_beyond_the_span_of_the_slope_the_temperature_does_not_drive_the_bias():
+    T = 25.0 + 0.01 * np.arange(4001)
+    record, _ = _still(2, np.array([3e-4, -2e-4, 1e-4]), np.clip(T, 30.0, 45.0), 0.05, 1e-5, 1e-3)
+    states = setup.States(gyro_temperature_sigma=5e-4, gyro_temperature_span=(30.0, 45.0))
+    assert setup.states.from_table(setup.states.to_table(states)) == states
+    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.01, bias_sigma=1e-3)
+    within, beyond = (
+        estimation.run(replace(record, temperature=course), noise, start, states.blocks({}))
+        for course in (record.temperature, T)
+    )
+    np.testing.assert_array_equal(beyond.bias, within.bias)
+    assert (np.abs(beyond.bias[-1] - 15.0 * np.array([3e-4, -2e-4, 1e-4])) < 4.0 * beyond.sigma[-1, 3:]).all()
+    with pytest.raises(InputError, match="span is"):
+        error_states.GyroTemperature(slope_sigma=5e-4, span=(45.0, 30.0))
+
+
 def test_where_nothing_drives_the_bias_the_state_is_refused():
     T = 25.0 + 0.01 * np.arange(101)
     record, _ = _still(2, np.zeros(3), T, 0.05, 1e-5, 1e-3)
@@ -269,11 +286,13 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
     sigma = setup.FilterSetup.for_scenario(curved, states=True).states.gyro_temperature_sigma
     np.testing.assert_allclose(sigma, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
+    # Below the span, where the bias is constant, the state is not driven, and the size of the slope is that within it.
+    beyond = replace(linear, temperature=scenarios.Temperature(start=5.0, end=40.0))
+    of_span = setup.FilterSetup.for_scenario(beyond, states=True).states
+    assert of_span.gyro_temperature_span == warm.span
+    np.testing.assert_allclose(of_span.gyro_temperature_sigma, [1e-5, 2e-5, 0.0], rtol=1e-12)
     # A parabola c₂ (T − T₀)² over T₀ ± h is at most 2/3 c₂ h² from its line of least squares, at the ends.
-    beyond = replace(
-        linear, temperature=scenarios.Temperature(start=5.0, end=40.0)
-    )  # below the span the bias is constant
-    for case, said in ((linear, False), (curved, True), (beyond, True)):
+    for case, said in ((linear, False), (curved, True), (beyond, False)):
         origin = records.Origin(gyro=case.gyro, scenario=case)
         words = setup.unmodelled_errors(origin, setup.FilterSetup.for_scenario(case, states=True))
         assert any("curve of the gyro's bias over temperature" in text for text in words) == said

@@ -207,6 +207,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     held = np.minimum(T, 27.0) - 25.0  # beyond the table's range the bias at its end
     expected = 1.0 - np.stack([0.1 + 1e-2 * held, 0.2 + 1e-3 * held**2, np.full(101, 0.3)], axis=1)
     np.testing.assert_allclose(corrected.rate, expected, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(corrected.temperature, held + 25.0)  # which drives the error of the slope
     assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
     assert "40 samples are beyond 20 to 27 °C" in corrected.remarks[-1]
     np.testing.assert_allclose(table.slope_sigma, [0.0, 0.0, 2e-4])

@@ -295,22 +295,27 @@ class GyroForce(ErrorStates):
 class GyroTemperature(ErrorStates):
     """Slopes c of the gyro's bias over temperature, constant, driven by the record's temperature: ``ḃ = c Ṫ + n_u``.
 
-    The filter's bias b is the whole bias, at the temperature of its time.
+    The filter's bias b is the whole bias, at the temperature of its time. Beyond the span, the temperature does not drive it.
 
     Parameters
     ----------
     slope_sigma : float or ndarray (3,)
         Standard deviation of the slope about each body axis, rad/s/K.
+    span : (float, float), default (-inf, inf)
+        Lowest and highest temperature, °C.
     name : str, default "gyro temperature"
         Name of these error states.
     """
 
     slope_sigma: float | Array
+    span: tuple[float, float] = (-np.inf, np.inf)
     name: str = "gyro temperature"
 
     def __post_init__(self) -> None:
-        """Check the standard deviation."""
+        """Check the standard deviation and the span."""
         sigma = _spread(f"{self.name}: slope_sigma", self.slope_sigma, "rad/s/K")
+        if not self.span[0] < self.span[1]:
+            raise InputError(f"{self.name}: span is {self.span}; its second temperature must be above the first")
         self._set(components=AXES, units=("rad/s/K",) * 3, sigma=sigma)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from strapdown.checks import Array, InputError, are_finite, count, is_definite, lengths
 from strapdown.estimation import model as modelling
 from strapdown.estimation.angular_acceleration import turning
-from strapdown.estimation.error_states import ErrorStates, spans, temperature_slopes
+from strapdown.estimation.error_states import ErrorStates, GyroTemperature, spans, temperature_slopes
 from strapdown.estimation.features import refuse
 from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
 from strapdown.estimation.model import Model
@@ -567,7 +567,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
-        warming=np.diff(temperature_of(problem.record)) / problem.record.intervals
+        warming=np.diff(driving_temperature(problem)) / problem.record.intervals
         if model.structure.slopes
         else np.empty(0),
         warming_now=np.zeros(1),
@@ -577,13 +577,14 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     return body
 
 
-def temperature_of(record: ImuRecord) -> Array:
-    """Return the temperature of a record (n + 1,), °C."""
-    if record.temperature is None:
+def driving_temperature(problem: Problem) -> Array:
+    """Return the temperature of the record (n + 1,), °C, within the span in which it drives the gyro's bias."""
+    if problem.record.temperature is None:
         raise InputError(
             "the record has no temperature, which drives the gyro's bias; give it, or leave the gyro temperature states out"
         )
-    return record.temperature
+    span = next(block.span for block in problem.error_states if isinstance(block, GyroTemperature))
+    return np.clip(problem.record.temperature, *span)
 
 
 def aligned_zeros(*shape: int) -> Array:

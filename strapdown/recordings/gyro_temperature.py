@@ -21,11 +21,11 @@ def temperature_at_samples(recording: Recording) -> Array:
 
 
 def applied(recording: Recording, warm: BiasOverTemperature) -> Recording:
-    """Return a recording with the gyro's bias over temperature subtracted and a temperature at every sample."""
+    """Return a recording with the gyro's bias over temperature subtracted and a temperature at every sample, within the span of the fit."""
     T = temperature_at_samples(recording)
     beyond = int(np.sum((warm.span[0] > T) | (warm.span[1] < T)))
     words = "The gyro's bias over temperature is subtracted; the estimated bias is the remainder."
     if beyond:
         words += f" {beyond} samples are beyond {warm.span[0]:.4g} to {warm.span[1]:.4g} °C; for them the bias at the limit is used."
     remarks = (*recording.remarks, words)
-    return replace(recording, rate=recording.rate - warm.bias(T), temperature=T, remarks=remarks)
+    return replace(recording, rate=recording.rate - warm.bias(T), temperature=np.clip(T, *warm.span), remarks=remarks)

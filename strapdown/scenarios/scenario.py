@@ -161,10 +161,10 @@ class Scenario(ByValue):
 
     @functools.cached_property
     def temperature_curve(self) -> float:
-        """Maximum deviation of the gyro's bias from a line over the temperatures of the record, rad/s; 0 below 1 % of its change."""
+        """Maximum deviation of the gyro's bias from a line over the fitted temperatures of the record, rad/s; 0 below 1 % of its change."""
         if self.gyro.temperature is None or self.temperature is None:
             return 0.0
-        T = self.temperature._at(self.edges)
+        T = np.clip(self.temperature._at(self.edges), *self.gyro.temperature.span)
         bias = self.gyro.temperature.bias(T)
         line = np.column_stack([np.ones_like(T), T - T[0]])
         deviation = np.abs(bias - line @ np.linalg.lstsq(line, bias)[0])

@@ -359,6 +359,7 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
     after = [case.last] if case.last < end else []
     slopes = _slopes(prepared.error_states)
     hot = range(6 + slopes.start, 6 + slopes.stop)
+    temperature = forward.driving_temperature(prepared) if hot else np.empty(0)
     return Prepared(
         case=case,
         steps=steps,
@@ -370,6 +371,6 @@ def _prepared(problem: Objective, case: Case) -> Prepared:
             record, prepared.events, prepared.model, forward.unit_sigmas(record, prepared.model, {})
         ),
         turning=forward.turns(prepared),
-        warming=forward.temperature_of(record) - forward.temperature_of(record)[0] if hot else np.empty(0),
+        warming=temperature - temperature[:1],
         driven=np.array([g.offset[g.state - hot[0]][0] for g in model.structure.gyro if g.state in hot], np.int64),
     )

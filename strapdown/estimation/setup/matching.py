@@ -59,7 +59,7 @@ def matched(
         gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
         gyro_force_sigma=_entries(np.diag(force)),
         gyro_cross_force_sigma=_entries(force - np.diag(np.diag(force))),
-        gyro_temperature_sigma=_slope(spec, record),
+        **_slope(spec, record),
         gyro_drift_sigma=drift_sigma,
         gyro_drift_time=drift_time,
         gyro_fast_bias_sigma=fast,
@@ -69,16 +69,19 @@ def matched(
     return states, white
 
 
-def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
-    """Return the slope of the bias over the record's temperature (3,), rad/s/K: its root mean square combined with its σ; 0 if none."""
-    if spec.temperature is None or record.temperature is None or np.ptp(record.temperature) == 0.0:
-        return 0.0
-    steps = np.diff(record.temperature)[:, None]
-    change = np.diff(spec.temperature.bias(record.temperature), axis=0)
+def _slope(spec: GyroSpec, record: ImuRecord) -> dict[str, Any]:
+    """Return the fields for the slope of the bias over temperature: its root mean square over the record combined with its σ."""
+    if spec.temperature is None or record.temperature is None:
+        return {}
+    T = np.clip(record.temperature, *spec.temperature.span)
+    if np.ptp(T) == 0.0:
+        return {}
+    steps, change = np.diff(T)[:, None], np.diff(spec.temperature.bias(T), axis=0)
     size = np.sqrt(
         np.sum(change * change / np.where(steps == 0.0, np.inf, np.abs(steps)), axis=0) / np.sum(np.abs(steps))
     )
-    return tuple(np.hypot(size, spec.temperature.slope_sigma).tolist())
+    sigma = tuple(np.hypot(size, spec.temperature.slope_sigma).tolist())
+    return {"gyro_temperature_sigma": sigma, "gyro_temperature_span": spec.temperature.span}
 
 
 def _entries(values: Array) -> Entries:

@@ -169,6 +169,8 @@ class States(ByValue):
         σ of the gyro's sensitivity to specific force across axes, rad/s per m/s², by entry; zeros on the diagonal.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
         σ of the slope of the gyro's bias over the temperature of the record, rad/s/K, by axis.
+    gyro_temperature_span : (float, float), default (-inf, inf)
+        Lowest and highest temperature of that slope, °C; beyond them the bias does not depend on temperature.
     gyro_drift_sigma : tuple of float, default empty
         Stationary σ of each Gauss–Markov part of the gyro's bias, rad/s; parts with correlation times a decade apart
         model flicker.
@@ -190,6 +192,7 @@ class States(ByValue):
     gyro_force_sigma: Entries = 0.0
     gyro_cross_force_sigma: Entries = 0.0
     gyro_temperature_sigma: Entries = 0.0
+    gyro_temperature_span: tuple[float, float] = (-np.inf, np.inf)
     gyro_drift_sigma: tuple[float, ...] = ()
     gyro_drift_time: tuple[float, ...] = ()
     gyro_fast_bias_sigma: float = 0.0
@@ -233,7 +236,8 @@ class States(ByValue):
             blocks.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
         if np.any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
             slope = np.asarray(self.gyro_temperature_sigma)
-            blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
+            span = self.gyro_temperature_span
+            blocks.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max()), span=span))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
             blocks.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
         return blocks
@@ -311,7 +315,11 @@ _SENSOR_PARTS = {
     "velocity": tuple(VELOCITY),
 }
 """Fields that declare each state of a sensor, by name."""
-_BESIDE = {"gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"), "correlated_sigma": ("correlation_time",)}
+_BESIDE = {
+    "gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"),
+    "gyro_temperature_sigma": ("gyro_temperature_span",),
+    "correlated_sigma": ("correlation_time",),
+}
 """Fields that belong to another field and declare no state."""
 Part = TypeVar("Part", States, SensorStates)
 
@@ -339,6 +347,7 @@ FORM: tables.Form = {
     "gyro_force_sigma": _FORCE,
     "gyro_cross_force_sigma": _FORCE,
     "gyro_temperature_sigma": (("deg_per_hour_per_kelvin", units.DEGREE_PER_HOUR), ("rad_per_s_per_kelvin", 1.0)),
+    "gyro_temperature_span": tables.DEGREES_CELSIUS,
     "gyro_drift_sigma": tables.DEGREES_PER_HOUR,
     "gyro_drift_time": tables.SECONDS,
     "gyro_fast_bias_sigma": tables.DEGREES_PER_HOUR,
