@@ -232,7 +232,9 @@ def first_state(
 ) -> State:
     """Return a state at the first edge from the first measurements: a measured attitude, or two or more directions (Wahba's problem).
 
-    Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias.
+    Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias. If a
+    measured attitude is an outlier, nothing contradicts it, and the filter accepts it too, even with a gate: its error is many σ until
+    later measurements have corrected it. Against this, give the initial attitude.
 
     Parameters
     ----------
