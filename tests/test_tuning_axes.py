@@ -77,6 +77,8 @@ def test_values_start_from_the_present_sigma_and_keep_the_ratios_of_the_axes():
     assert value == pytest.approx(3e-5 * np.sqrt(14.0 / 3.0))
     assert tuning.with_values(three, {"star.sigma": 2.0 * value}).sigma["star"] == pytest.approx((2e-5, 4e-5, 6e-5))
     assert tuning.unit_of("star.sigma", [record]).name == "arcsec"
+    # As the estimate prints the error states of such a sensor.
+    assert tuning.unit_of("acc.sigma", [scenarios.simulate(swaying(duration=1.0), 1)]).name == "unit of the reference"
 
 
 @pytest.mark.parametrize(("seeds", "squares"), [(6, (0.1, 3.0)), pytest.param(60, (0.7, 1.4), marks=pytest.mark.slow)])

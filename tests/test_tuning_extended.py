@@ -397,7 +397,7 @@ def test_after_tuning_held_out_statistics_pass(name, test, duration):
 
 def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
     degree, g = np.pi / 180.0, 9.80665
-    size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad, or the vector's unit": 1.0}
+    size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad, or unit of the reference": 1.0}
     size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
     size |= {"°/h/K": degree / 3600.0, "°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
     names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters.WHOLE)

@@ -52,7 +52,7 @@ class Unit(NamedTuple):
 
 _PER_HOUR = Unit("°/h", units.DEGREE_PER_HOUR)
 _PER_G = Unit("°/h/g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY)
-_OF_SENSOR = Unit("rad, or the vector's unit", 1.0)
+_OF_SENSOR = Unit("rad, or unit of the reference", 1.0)
 
 PLAIN = {
     ARW: (("process_noise", "angle_random_walk"), Unit("°/√h", units.DEGREE_PER_ROOT_HOUR)),
@@ -145,7 +145,7 @@ def unit_of(name: str, records: Sequence[ImuRecord] = ()) -> Unit:
     sensor = name.removesuffix(SIGMA)
     kinds = [series.kind for record in records for series in record.vectors if series.sensor == sensor]
     if kinds and kinds[0] == "vector":
-        return Unit("unit of the vector", 1.0)
+        return Unit("unit of the reference", 1.0)
     if own_sigma(sensor, records) > 0.1 * units.DEGREE:
         return Unit("°", units.DEGREE)
     return Unit("arcsec", units.ARCSECOND)
