@@ -49,7 +49,10 @@ class Alignment:
     body: Array
     """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
     covariance: Array
-    """Covariance (7, 7) of the rotations, about the estimate's fixed and the truth's body axes, rad, and offset, s; 0 if not estimated."""
+    """Covariance (7, 7) of the rotations, about the estimate's fixed and the truth's body axes, rad, and offset, s; 0 if not estimated.
+
+    It is that of the remaining errors and their correlation. If a long outage dominates them, and no covariance says so, it is too small.
+    """
     estimated: tuple[str, ...]
     """Which of :data:`ALIGNED` were estimated and removed."""
     residual: float
