@@ -77,6 +77,8 @@ def montecarlo(
     ui.check_files(target, suffixes=HDF5, reads=False)
     ui.check_files(beside)
     if replay is not None:
+        for name in options_given(replace(computing, machine="auto")):
+            raise InputError(f"{name} goes with a campaign, and --replay repeats one of its runs; leave it out")
         if held is not None and replay >= held.runs:
             raise InputError(f"--replay is {replay}, and {source} has the runs 0 to {held.runs - 1}; give one of them")
         _replay(plan, replay, computing.machine, target)
