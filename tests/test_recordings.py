@@ -234,6 +234,7 @@ def test_vectors_of_a_record_are_at_their_stamps():
     none = np.full(3, np.nan)
     np.testing.assert_array_equal(recording.specific_force, [g, none, none, 3.0 * g])
     assert recording.magnetic_field is None
+    assert recording.remarks[0].startswith("From a record")  # which may be measured
     assert "Left out: magnetometer (direction)." in " ".join(recording.remarks)
     assert "only whole vectors of sensors named accelerometer and magnetometer" in " ".join(recording.remarks)
 
@@ -394,7 +395,7 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
         ("binary.csv", bytes(range(256)) * 8, ()),
         ("excel.csv", "time,gx".encode("utf-16"), ("write it in UTF-8, not UTF-16",)),
         ("walk.mat", b"\0" * 100, ("extension '.mat'", ".csv")),
-        ("flight.toml", b"rate_hz = 100.0\n", ("extension '.toml'", ".csv")),
+        ("flight.toml", b"rate_hz = 100.0\n", ("is no recording", "`strapdown simulate`")),
         ("walk.h5", b"time,gx", ("cannot be read as HDF5", "of another kind")),
         ("estimate.h5", None, ("is a strapdown estimate, a result, not a recording; give the recording that it was",)),
     ],

@@ -155,7 +155,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     if file.is_dir() and not recognised:
         raise InputError(f"{path} is a folder; name the file in it, unless it is a ROS 2 bag or EuRoC with imu0")
     recognised += [candidate for candidate in FORMATS if file.suffix.lower() in candidate.endings]
-    if table.recognised(file, head) and file.suffix.lower() != ".toml":
+    if not recognised and file.suffix.lower() == ".toml":
+        raise InputError(f"{file} is no recording; `strapdown simulate` makes the record of a scenario")
+    if table.recognised(file, head):
         recognised.append(table)
     if recognised:
         return recognised[0]
@@ -273,7 +275,7 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
 
 
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
-    """Return a simulated record of n intervals as a recording of n samples.
+    """Return a record of n intervals as a recording of n samples.
 
     The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro, and so delayed by half an
     interval. Series of kind "vector" named accelerometer and magnetometer are included, at the stamps where they have samples; the truth is
@@ -292,7 +294,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
                 own["magnetic_unit"] = "T"
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
-    remarks = ["Simulated record: the rate at each time stamp is the mean over the sample interval before it."]
+    remarks = ["From a record: the rate at each time stamp is the mean over the sample interval before it."]
     if left_out:
         remarks.append(
             f"Left out: {', '.join(left_out)}. A recording has only whole vectors of sensors named accelerometer and magnetometer."
