@@ -173,6 +173,9 @@ def _unequal_axes(spec: GyroSpec, filter_setup: FilterSetup) -> list[SpecifiedEr
     for name, words in _NOISES.items():
         values = np.broadcast_to(getattr(spec, name), 3)
         if values.max() > DIFFERENT_AXES * values.min():
-            differ.append(f"{words} ×{values.max() / values.min():.3g}" if values.min() > 0.0 else f"{words} ×∞")
-    words = f"the difference of the gyro's axes ({', '.join(differ)}; σ about the quieter ones are too large, by at most these factors)"
+            differ.append(
+                f"{words} ×{values.max() / values.min():.3g}" if values.min() > 0.0 else f"{words} of some axes only"
+            )
+    bound = ", by at most these factors" if all("×" in text for text in differ) else ""
+    words = f"the difference of the gyro's axes ({', '.join(differ)}; σ about the quieter ones are too large{bound})"
     return [SpecifiedError("gyro", "difference of axes", words)] if differ else []
