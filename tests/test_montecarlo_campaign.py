@@ -411,7 +411,7 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     held = campaign.read("short-montecarlo.h5")
     status, _, error = command("short-montecarlo.h5", "--replay", 6)
     assert (status, "has the runs 0 to 5; give one of them" in " ".join(error.split())) == (2, True)
-    assert "--runs goes with a campaign" in command("short-montecarlo.h5", "--replay", 5, "--runs", 6)[2]
+    assert "exclude each other" in command("short-montecarlo.h5", "--replay", 5, "--overwrite")[2]
     status, said, _ = command("short-montecarlo.h5", "--replay", 5)
     assert status == 0
     assert "Run 5 of seed 1" in said

@@ -70,15 +70,13 @@ def montecarlo(
         computing = replace(computing, machine=held.machine)
     target = out or (source if held is not None else Path(f"{source.stem}-montecarlo.h5"))
     beside = target.with_suffix(".json")
-    if computing.resume and computing.overwrite:
-        raise InputError("--resume and --overwrite exclude each other; give one of them")
+    if computing.resume + computing.overwrite + (replay is not None) > 1:
+        raise InputError("--resume, --overwrite and --replay exclude each other; give one of them")
     if beside.exists() and not target.exists() and not computing.overwrite and replay is None:
         raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
     ui.check_files(target, suffixes=HDF5, reads=False)
     ui.check_files(beside)
     if replay is not None:
-        for name in options_given(replace(computing, machine="auto")):
-            raise InputError(f"{name} goes with a campaign, and --replay repeats one of its runs; leave it out")
         if held is not None and replay >= held.runs:
             raise InputError(f"--replay is {replay}, and {source} has the runs 0 to {held.runs - 1}; give one of them")
         _replay(plan, replay, computing.machine, target)
