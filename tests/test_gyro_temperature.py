@@ -142,7 +142,7 @@ def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_ever
         np.zeros((3, 3)),
         np.diag([0.01, 1e-3, prior]) ** 2,
     )  # states by rows, axes by columns: P is that of each axis
-    rows, spreads = [], []
+    rows, spreads, steps = [], [], []
     Q = np.zeros((3, 3))
     Q[:2, :2] = [
         [white**2 * dt + walk**2 * dt**3 / 3.0, -(walk**2) * dt**2 / 2.0],
@@ -150,9 +150,11 @@ def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_ever
     ]
     for k in range(n):
         F = np.array([[1.0, -dt, -middle[k] * dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        before = x, P
         x = F @ x
         x[0] += record.increments[k]
         P = F @ P @ F.T + Q
+        steps.append((*before, x, P, F))
         if (k + 1) % 10 == 0:
             K = P @ H / (P[0, 0] + sensor**2)
             x, P = x + np.outer(K, angles[(k + 1) // 10 - 1] - x[0]), P - np.outer(K, H @ P)
@@ -166,6 +168,19 @@ def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_ever
     assert np.abs((ours - rows) / sigma)[20:].max() < 5e-3
     spread = np.stack([estimate.sigma[:, :3], estimate.sigma[:, 3:], slopes.sigma], axis=1)[1:]
     assert np.abs(spread / sigma - 1.0).max() < 1e-6
+    # The smoother, at the start: Rauch, Tung & Striebel.
+    for x_f, P_f, x_p, P_p, F in reversed(steps):
+        C = np.linalg.solve(P_p, F @ P_f).T
+        x, P = x_f + C @ (x - x_p), P_f + C @ (P - P_p) @ C.T
+    smoothed = estimation.smooth(record, noise, start, (block,))
+    slopes, sigma = smoothed.error_states["gyro temperature"], np.sqrt(np.diag(P))
+    ours = np.stack([smoothed.rotation[0].as_rotvec(), smoothed.bias[0], slopes.values[0]])
+    assert (np.abs(ours - x) < 5e-3 * sigma[:, None]).all()
+    spread = np.stack([smoothed.sigma[0, :3], smoothed.sigma[0, 3:], slopes.sigma[0]])
+    np.testing.assert_allclose(spread, np.tile(sigma[:, None], 3), rtol=1e-4)
+    np.testing.assert_allclose(smoothed.bias[-1], estimate.bias[-1], rtol=1e-12)
+    observed = estimation.observability(record, noise, start, (block,))
+    np.testing.assert_allclose(observed.start_sigma, spread.ravel(), rtol=1e-4)
 
 
 @pytest.mark.parametrize("gate", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["parts", "gate"])
@@ -194,6 +209,11 @@ def test_parts_of_a_record_and_a_gate_agree_with_the_whole(gate):
     assert [event.kind for event in gated.events] == ["recovery"]
     slope = gated.error_states["gyro temperature"]
     assert (np.abs(slope.values[-1] - [3e-4, -2e-4, 1e-4]) < 4.0 * slope.sigma[-1]).all()
+    # The smoother, in parts at the recovery.
+    smoothed = estimation.smooth(faulty, noise, start, blocks, gate=Gate(probability=0.999, recovery=5))
+    bias = (T - T[0])[:, None] * np.array([3e-4, -2e-4, 1e-4])
+    assert (np.abs(smoothed.bias - bias) < 5.0 * smoothed.sigma[:, 3:]).all()
+    np.testing.assert_allclose(smoothed.bias[-1], gated.bias[-1], rtol=1e-9)
 
 
 def test_beyond_the_span_of_the_slope_the_temperature_does_not_drive_the_bias():
@@ -221,10 +241,8 @@ def test_where_nothing_drives_the_bias_the_state_is_refused():
     blocks = (error_states.GyroTemperature(slope_sigma=5e-4),)
     with pytest.raises(InputError, match="the record has no temperature, which drives the gyro's bias"):
         estimation.run(replace(record, temperature=None), noise, start, blocks)
-    with pytest.raises(InputError, match="has no bias driven by temperature"):
-        estimation.smooth(record, noise, start, blocks)
-    with pytest.raises(InputError, match="has no bias driven by temperature"):
-        estimation.observability(record, noise, start, blocks)
+    with pytest.raises(InputError, match="a filter of single samples has no bias driven by temperature"):
+        estimation.LiveFilter(noise, start, blocks, sensors=record.vectors)
     with pytest.raises(InputError, match="slope_sigma"):
         error_states.GyroTemperature(slope_sigma=[1e-4, 0.0, 1e-4])
 

@@ -17,8 +17,7 @@ import numpy as np
 from strapdown.checks import Array, InputError, are_finite, count, is_definite, lengths
 from strapdown.estimation import model as modelling
 from strapdown.estimation.angular_acceleration import turning
-from strapdown.estimation.error_states import ErrorStates, GyroTemperature, spans, temperature_slopes
-from strapdown.estimation.features import refuse
+from strapdown.estimation.error_states import ErrorStates, GyroTemperature, spans
 from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
 from strapdown.estimation.model import Model
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
@@ -180,7 +179,7 @@ def run(
         If an argument is invalid.
     """
     options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
-    return filtered(prepared(record, process_noise, initial, error_states, driven=True), options).estimate
+    return filtered(prepared(record, process_noise, initial, error_states), options).estimate
 
 
 def run_part(
@@ -205,7 +204,7 @@ def run_part(
     acceleration is computed from the gyro samples around each measurement, at a cut from those on one side.
     """
     options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
-    passed = filtered(prepared(record, process_noise, initial, error_states, driven=True), options)
+    passed = filtered(prepared(record, process_noise, initial, error_states), options)
     return passed.estimate, passed.end
 
 
@@ -224,7 +223,7 @@ def run_spans(
     The row of a common edge is that before the change. Whole covariances are those of attitude and bias only.
     """
     options = Options(full_covariance=True, error_state_covariance=False, gate=gate, robust=robust)
-    problem = prepared(record, process_noise, initial, error_states, driven=True)
+    problem = prepared(record, process_noise, initial, error_states)
     return filtered(replace(problem, spans=tuple(spans)), options).estimate
 
 
@@ -233,16 +232,10 @@ def prepared(
     process_noise: ProcessNoise,
     initial: State,
     error_states: Sequence[ErrorStates],
-    *,
-    driven: bool = False,
 ) -> Problem:
-    """Return a record with its measurements in order of time, and the error states as arrays.
-
-    ``driven``: whether a bias driven by temperature is allowed.
-    """
+    """Return a record with its measurements in order of time, and the error states as arrays."""
     check_arguments(record=record, process_noise=process_noise)
     declared = modelling.as_blocks(error_states)
-    refuse("this estimator", temperature=not driven and temperature_slopes(declared) is not None)
     state = modelling.begin(initial, declared)
     events = schedule(record.vectors, record.time[0], record.time[-1])
     kinds = dict(zip(events.sensors, events.kinds, strict=True))

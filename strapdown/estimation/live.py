@@ -31,7 +31,7 @@ from strapdown.checks import (
 )
 from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
-from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.error_states import ErrorStates, temperature_slopes
 from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import Judge, Options, gate_events, last_lock_outs
 from strapdown.estimation.gating import Gate, Robust
@@ -131,7 +131,8 @@ class LiveFilter:
         # The kernels process each interval as a record; this one, without rotation, defines its arrays.
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
-        refuse("a filter of single samples", record=self._problem.model.of_record)
+        driven = temperature_slopes(self._problem.error_states) is not None
+        refuse("a filter of single samples", record=self._problem.model.of_record, temperature=driven)
         options = Options(every=ONE_ROW, gate=gate, robust=robust)
         self._judge, self._judged = Judge(self._problem, options), options.judged
         self._writers = {

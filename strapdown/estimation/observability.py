@@ -209,4 +209,4 @@ def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
             exact_f = np.concatenate([exact_f[:, :2] / level * size, measured_f[:, 2:]], axis=1)
         exact_b = np.where(np.isfinite(s.vector_b), quaternion.rotate(inverse, exact_f), np.nan)
         series.append(dataclasses.replace(s, vector_b=exact_b))
-    return ImuRecord(time=record.time, increments=turns, vectors=tuple(series))
+    return ImuRecord(time=record.time, increments=turns, vectors=tuple(series), temperature=record.temperature)

@@ -251,7 +251,12 @@ def _part(problem: Problem, begin: float, end: float, initial: State, *, closed:
         return (at >= begin) & (at < before)
 
     series = tuple(vectors.taken(inside(vectors.time)) for vectors in record.vectors)
-    part = ImuRecord(time=time, increments=share[:, None] * record.increments[k], vectors=series)
+    temperature = None
+    if model.structure.slopes:
+        temperature = np.interp(time, record.time, forward.driving_temperature(problem))
+    part = ImuRecord(
+        time=time, increments=share[:, None] * record.increments[k], vectors=series, temperature=temperature
+    )
     initial = replace(initial, unit_sigma=forward.unit_sigmas(record, model, initial.unit_sigma))
     shorter = forward.prepared(part, problem.process_noise, initial, problem.error_states)
     if not model.levers.any():
@@ -364,7 +369,12 @@ class _ManyStates:
             np.zeros(n + kernels.NOISY_WIDTH),
             np.zeros(chains.SET * max(len(model.last), 1)),
         )
-        space = smoother.Workspace._make((*states, *matrices, *others, noisy))
+        warming = np.empty(0)
+        if without.slopes:
+            share = segments[:-1, 0] / np.repeat(self.problem.record.intervals, np.diff(starts))
+            change = np.diff(forward.driving_temperature(self.problem))
+            warming = 0.5 * share * np.repeat(change, np.diff(starts))
+        space = smoother.Workspace._make((*states, *matrices, *others, noisy, warming))
         steps_back = model._replace(  # noise of negative variance
             angle_variance=-model.angle_variance, rate_variance=-model.rate_variance, chains=model.chains * [1.0, -1.0]
         )

@@ -17,12 +17,13 @@ import numpy as np
 
 from strapdown.kernels.chains import fill_coefficients
 from strapdown.kernels.lane_values import WIDTH, broadcast, lanes_of, load, load_like, store
-from strapdown.kernels.layout import CHUNKS, EIGHT, STATES, N, W, chunk_at, copy_values, put_chunk
+from strapdown.kernels.layout import CHUNKS, EIGHT, STATES, STRUCTURE, N, W, chunk_at, copy_values, put_chunk
 from strapdown.kernels.model import (
     CHAINED,
     advance_state,
     advance_without_noise,
     apply_transition,
+    warm,
     write_noise,
     write_transition,
 )
@@ -81,6 +82,8 @@ class Workspace(NamedTuple):
     coefficients: np.ndarray
     states: np.ndarray
     """States with process noise."""
+    warming: np.ndarray
+    """Half the change of temperature in each segment, K; empty without slopes of the bias."""
 
 
 class Outputs(NamedTuple):
@@ -177,12 +180,17 @@ def add_product(A, row, column, B, C, count, inner, width):
 def step_back(segments, k, models, space):
     """Propagate the smoothed state from the end of segment k back to its start.
 
-    A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ.
+    A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ. If temperature drives
+    the bias, its changes before and after the step have no noise: both states are transformed to the step's start and end without them.
     """
     x, predicted, after = space.x, space.predicted, space.after
     P, Q, gain, kept, columns, block = space.P, space.Q, space.gain, space.kept, space.columns, space.block
     later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
     load_segment(segments, k, x, P)
+    if STRUCTURE.slopes:
+        mirror(P)
+        warm(x, P, space.warming[k])
+        warm(later_x, later_P, -space.warming[k])
     dt = segments[k, 0]
     part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
     copy_values(x, predicted, N + 1, 0.0)
@@ -212,6 +220,8 @@ def step_back(segments, k, models, space):
     add_product(gain, 1, NOISY_WIDTH, columns, block, len(NOISY), N, NOISY_WIDTH)
     scatter_noisy_columns(columns, block, later_P)
     correct_filtered(x, error, later_x, later_P)
+    if STRUCTURE.slopes:
+        warm(later_x, later_P, -space.warming[k])
 
 
 def clear(A, start):

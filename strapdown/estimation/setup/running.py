@@ -280,7 +280,7 @@ def _with_states(record: ImuRecord, setup: FilterSetup, initial: State) -> tuple
 
 def prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.Problem:
     """Return a :func:`modelled_record` prepared for the filter with the setup's error states."""
-    return forward.prepared(record, setup.process_noise, *_with_states(record, setup, initial), driven=True)
+    return forward.prepared(record, setup.process_noise, *_with_states(record, setup, initial))
 
 
 def _reported(estimate: Estimate, states: States, initial: State) -> Estimate:
