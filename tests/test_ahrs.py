@@ -596,11 +596,25 @@ def in_a_swell(seed: int, duration: float = 300.0) -> Recording:
     )
 
 
+def vibrating(recording: Recording, rms: float) -> Recording:
+    """The recording with white vibration of that RMS value on each axis of the accelerometer, m/s²."""
+    white = np.random.default_rng(7).standard_normal(recording.rate.shape)
+    return dataclasses.replace(recording, specific_force=recording.specific_force + rms * white)
+
+
+@pytest.mark.parametrize("field", [True, False])
+def test_a_unit_that_vibrates_rests_after_four_seconds(field):
+    rests = rests_of(vibrating(quiet_second((0.4, -0.3, 0.2), field=field, length=60.0), 0.5))
+    assert len(rests.last) >= 50
+    np.testing.assert_allclose(rests.rate, np.tile((0.4, -0.3, 0.2), (len(rests.last), 1)) * DEGREE, atol=0.02 * DEGREE)
+
+
+@pytest.mark.parametrize("vibration", [0.0, 0.3])
 @pytest.mark.parametrize(("magnetometer", "most"), [(True, 0), (False, 3)])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_ship_in_waves_hardly_ever_rests(seed, magnetometer, most):
+def test_a_ship_in_waves_hardly_ever_rests(seed, magnetometer, most, vibration):
     """A second in which the rate hardly changes is frequent; that vertical and field are fixed in it is a coincidence of all."""
-    ship = in_a_swell(seed)
+    ship = vibrating(in_a_swell(seed), vibration)
     ship = ship if magnetometer else dataclasses.replace(ship, magnetic_field=None, magnetic_unit="")
     assert len(rests_of(ship).last) <= most
 

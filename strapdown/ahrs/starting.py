@@ -32,6 +32,11 @@ TURNING_RATE = 0.3 * DEGREE
 """Mean rate, rad/s, above which vertical and field are examined for a rotation with it."""
 CHANGE_BY_NOISE = 3e-3
 """Change of the mean specific force or field, relative to it, from half to half of a span at rest."""
+VIBRATION_SPANS, VIBRATION_ODDS = 5, 3.0
+"""Number of successive spans in which a unit rests though its specific force changes by more, if their means agree to within that factor
+times the σ that vibration gives them. On 88 recordings such spans agree with other rests, on simulated ships there are none."""
+VIBRATION_BIAS = 0.25 * DEGREE
+"""Maximum σ of the bias then, rad/s: a rate beyond that factor times it may be a steady turn."""
 TURN_ODDS = 5.0
 """Difference of a mean rate from the bias by the rests before, relative to its σ, above which it is a turn."""
 FIELD_TURN, FIELD_TIME = 0.5 * DEGREE, 15.0
@@ -304,6 +309,9 @@ def constants_of(interval: float, parameters: AhrsParameters, *, magnetometer: b
         unmodelled=walk - modelled,
         slow_walk=SLOW_DRIFT**2,
         noise=CHANGE_BY_NOISE**2,
+        vibration_odds=VIBRATION_ODDS**2,
+        vibration_bias=VIBRATION_BIAS**2,
+        vibration_spans=VIBRATION_SPANS,
         field_turn=FIELD_TURN**2,
         field_time=FIELD_TIME,
     )
@@ -312,9 +320,12 @@ def constants_of(interval: float, parameters: AhrsParameters, *, magnetometer: b
 def memory_of(interval: float, parameters: AhrsParameters) -> kernel.Memory:
     """Return the kernel's memory before the first sample."""
     return kernel.Memory(
-        tenths=np.zeros((rest_length(interval)[0], 4)),
+        tenths=np.zeros((rest_length(interval)[0], 3)),
+        force_tenths=np.zeros((rest_length(interval)[0], 4)),
         halves=np.zeros((4, 3)),
         halves_number=np.zeros(4, np.int64),
+        steady=np.zeros((2, 3)),
+        steady_spans=np.zeros(1, np.int64),
         resting=np.zeros(2, np.int64),
         rest_rate=np.zeros((1, 3)),
         rest_variance=np.array([np.inf]),

@@ -177,7 +177,7 @@ def init(f: Any) -> Any:
             f.drift[i] = 1.0 if i == 0 else 0.0
     if r.imu.rests:
         rests.clear_span(f)
-        f.resting[1] = 0
+        f.resting[1] = f.steady_spans[0] = 0
         f.bias_variance[0], f.plausible_variance[0] = r.parameters.bias_sigma**2, starting.FIRST_BIAS_SIGMA**2
         for i in range(3):
             f.rest_bias[0, i] = 0.0

@@ -36,6 +36,12 @@ class Constants(NamedTuple):
     """Squared mean rate, (rad/s)², above which vertical and field are examined for a rotation with it."""
     noise: float
     """Squared change of specific force and field from half to half, relative to them, by noise at rest."""
+    vibration_odds: float
+    """Squared change of mean rate and specific force, relative to its variance by vibration, above which it is motion."""
+    vibration_bias: float
+    """Maximum variance of a bias that is measured while the unit vibrates, (rad/s)²."""
+    vibration_spans: int
+    """Number of successive spans that must agree then."""
     walk: float
     """Variance that the bias gains in a second between rests."""
     unmodelled: float
@@ -52,11 +58,17 @@ class Memory(NamedTuple):
     """What lasts from one sample to the next."""
 
     tenths: np.ndarray
-    """Sums of the rate over the parts of the span, and number of the accelerometer's samples (parts, 4)."""
+    """Sums of the rate over the parts of the span (parts, 3)."""
+    force_tenths: np.ndarray
+    """Sums of the specific force over them, and number of its samples (parts, 4)."""
     halves: np.ndarray
     """Sums of specific force and field over its halves (4, 3)."""
     halves_number: np.ndarray
     """Number of samples in the halves (4,)."""
+    steady: np.ndarray
+    """Mean rate, rad/s, and specific force of the first of the spans since which they have changed no more than by vibration (2, 3)."""
+    steady_spans: np.ndarray
+    """Number of those spans (1,)."""
     resting: np.ndarray
     """Number of samples in the span; 1 if it shows more of the bias, 2 if the next step begins with it (2,)."""
     rest_rate: np.ndarray
@@ -104,7 +116,8 @@ def find_rests(constants, time, rate, force, field, memory, means):
         part, half = k // constants.part, k // ((length + 1) // 2)
         add(memory.tenths, part, vector_at(rate, i))
         if is_sample(vector_at(force, i)):
-            memory.tenths[part, 3] += 1.0
+            memory.force_tenths[part, 3] += 1.0
+            add(memory.force_tenths, part, vector_at(force, i))
         add_known(memory, half, vector_at(force, i))
         if len(field) > 0:
             add_known(memory, 2 + half, vector_at(field, i))
@@ -141,7 +154,7 @@ def clear_span(memory):
     memory.resting[0] = 0
     for i in range(4):
         memory.halves_number[i] = 0
-    for sums in (memory.tenths, memory.halves):
+    for sums in (memory.tenths, memory.force_tenths, memory.halves):
         for i in range(len(sums)):
             for j in range(sums.shape[1]):
                 sums[i, j] = 0.0
@@ -153,18 +166,10 @@ def find_rest(constants, time, memory):
     The variance of its mean rate is that of a unit at rest and the spread of the rate between the parts, which is motion of the hand. A
     span with a gap is no rest, nor one with which the vertical or the field rotates, nor one that is faster than a bias that the rests
     before leave possible: a steady turn is no bias. Nor is a rate with which the field turns slowly. At rest the specific force hardly
-    changes; on waves it may turn against the rate.
+    changes, while on waves it may turn against the rate; where it vibrates, several seconds must agree.
     """
-    parts, part = constants.parts, constants.part
-    rate = (0.0, 0.0, 0.0)
-    for i in range(parts):
-        rate = combine(1.0, rate, 1.0 / part, vector_at(memory.tenths, i))
-    rate = (rate[0] / parts, rate[1] / parts, rate[2] / parts)
-    spread, covered = 0.0, 0.0
-    for i in range(parts):
-        covered += min(memory.tenths[i, 3], 1.0)
-        off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
-        spread += dot(off, off)
+    parts = constants.parts
+    rate, spread, covered = mean_of_parts(constants, memory)
     variance = constants.own_variance + spread / parts
     since = time - memory.rest_clock[1]
     known = memory.bias_variance[0] + constants.walk * since
@@ -176,15 +181,20 @@ def find_rest(constants, time, memory):
     turns = changed and 4.0 * dot(rate, rate) > dot(bias, bias)
     with_force, square_force, change_force = turned_with(constants, rate, memory, 0)
     with_field, square_field, _ = turned_with(constants, rate, memory, 2)
-    fixed = with_force <= 0.5 * square_force and with_field <= 0.5 * square_field + constants.noise
-    quiet = (
+    slow = dot(rate, rate) <= constants.turning
+    possible = (
         variance < constants.max_variance
         and time - memory.rest_clock[0] < 1.5 * constants.span
         and 2.0 * covered > parts
         and not turns
-        and (dot(rate, rate) <= constants.turning or fixed)
-        and change_force <= 0.1 * square_force + constants.noise
+        and (slow or with_field <= 0.5 * square_field + constants.noise)
     )
+    fixed = (slow or with_force <= 0.5 * square_force) and change_force <= 0.1 * square_force + constants.noise
+    own = constants.own_variance + constants.vibration_odds * spread / parts**2
+    count_steady(constants, possible, rate, own, memory)
+    bias_variance = constants.vibration_odds * min(known, constants.vibration_bias)
+    shaken = memory.steady_spans[0] >= constants.vibration_spans and dot(change, change) <= own + bias_variance
+    quiet = possible and (fixed or shaken)
     still = quiet
     if constants.with_field > 0:
         if variance >= constants.max_variance:
@@ -201,6 +211,52 @@ def find_rest(constants, time, memory):
         memory.bias_variance[0] = 1.0 / (1.0 / known + 1.0 / variance)
         memory.plausible_variance[0] = 1.0 / (1.0 / plausible + 1.0 / variance)
         store_row(memory.rest_bias, 0, combine(1.0, bias, plausible / (plausible + variance), change))
+
+
+def mean_of_parts(constants, memory):
+    """Return the mean rate, the sum of its squared changes over the parts, and the number of parts with a specific force."""
+    parts, part = constants.parts, constants.part
+    rate = (0.0, 0.0, 0.0)
+    for i in range(parts):
+        rate = combine(1.0, rate, 1.0 / part, vector_at(memory.tenths, i))
+    rate = (rate[0] / parts, rate[1] / parts, rate[2] / parts)
+    spread, covered = 0.0, 0.0
+    for i in range(parts):
+        covered += min(memory.force_tenths[i, 3], 1.0)
+        off = combine(1.0 / part, vector_at(memory.tenths, i), -1.0, rate)
+        spread += dot(off, off)
+    return rate, spread, covered
+
+
+def count_steady(constants, possible, rate, allowed, memory):
+    """Count the successive spans, possibly at rest, since whose first mean rate and specific force have changed no more than by vibration.
+
+    Vibration is white from part to part, so that the differences of successive parts show its variance; waves and turns hardly differ in a
+    tenth of a second. ``allowed``: squared error of a mean rate.
+    """
+    spread, pairs = 0.0, 0
+    for i in range(1, constants.parts):
+        before, after = memory.force_tenths[i - 1, 3], memory.force_tenths[i, 3]
+        if before > 0.0 and after > 0.0:
+            step = combine(
+                1.0 / after, vector_at(memory.force_tenths, i), -1.0 / before, vector_at(memory.force_tenths, i - 1)
+            )
+            spread, pairs = spread + 0.5 * dot(step, step), pairs + 1
+    share = 1.0 / max(memory.halves_number[0] + memory.halves_number[1], 1)
+    force = combine(share, vector_at(memory.halves, 0), share, vector_at(memory.halves, 1))
+    turn = combine(1.0, rate, -1.0, vector_at(memory.steady, 0))
+    change = combine(1.0, force, -1.0, vector_at(memory.steady, 1))
+    vibration = constants.vibration_odds * spread / (max(pairs, 1) * constants.parts)
+    agrees = (
+        dot(turn, turn) <= 2.0 * allowed
+        and dot(change, change) <= constants.noise * dot(force, force) + 2.0 * vibration
+    )
+    if possible and agrees and memory.steady_spans[0] > 0:
+        memory.steady_spans[0] += 1
+    else:
+        memory.steady_spans[0] = 1 if possible else 0
+        store_row(memory.steady, 0, rate)
+        store_row(memory.steady, 1, force)
 
 
 def turns_slowly(constants, rate, change, time, memory):
