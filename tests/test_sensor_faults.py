@@ -347,6 +347,20 @@ def test_a_clipped_accelerometer_is_left_out():
     assert f"clipped in {np.sum(lost)} samples" in faults.words[0]
 
 
+def test_a_sensor_that_is_often_clipped_is_warned_of():
+    plain = swing()
+    force = np.clip(
+        plain.specific_force + 30.0 * np.sin(40.0 * plain.time)[:, None] * (plain.time > 5.0)[:, None], -19.6, 19.6
+    )
+    for sensor, clipped in (
+        ("gyro", with_rate(plain, 4.0)),
+        ("accelerometer", dataclasses.replace(plain, specific_force=force)),
+    ):
+        with pytest.warns(ahrs.ConventionWarning, match=f"the {sensor} is clipped in .*% of its samples.*larger"):
+            sd.estimate(clipped)
+    assert not sensor_faults.clipped_words(with_rate(plain, 7.8))
+
+
 def with_damaged(name: str, rows: slice, size: float) -> tuple[Recording, Recording]:
     """A recording, and the same with samples of a size in any direction; each of these is different."""
     plain = swing(10.0)

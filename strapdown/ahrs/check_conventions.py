@@ -272,6 +272,7 @@ def _examined(recording: Recording) -> Examination:
             unsaid = []
     if upright and result.verdict == "as declared":
         result = replace(result, verdict="cannot tell", reason="the sensors agree; see the warning on their sign")
+    doubts = doubts + sensor_faults.clipped_words(recording)
     return replace(result, doubts=tuple(upright + (unsaid if result.verdict == "cannot tell" else []) + doubts))
 
 

@@ -346,6 +346,20 @@ def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
     return np.asarray(length**2 * np.maximum(inner - 0.25 * np.interp(length, time, square), 0.0))
 
 
+MAX_CLIPPED = 0.05
+"""Maximum share of clipped samples that is no warning."""
+
+
+def clipped_words(recording: Recording) -> list[str]:
+    """Return a warning for gyro and accelerometer if many of its samples are clipped."""
+    sensors = ("gyro", recording.rate, MIN_CLIPPED_RATE), ("accelerometer", recording.specific_force, MIN_CLIPPED_FORCE)
+    return [
+        f"the {sensor} is clipped in {share:.0%} of its samples: the motion exceeds its range; record with a larger one"
+        for sensor, samples, least in sensors
+        if samples is not None and (share := np.mean(clipped_samples(samples, least).any(axis=1))) > MAX_CLIPPED
+    ]
+
+
 MIN_BURSTS = 0.015
 """Minimum share of long intervals between stamps that come in bursts; of a recording with gaps it is smaller."""
 
