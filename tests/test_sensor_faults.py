@@ -361,6 +361,16 @@ def test_a_sensor_that_is_often_clipped_is_warned_of():
     assert not sensor_faults.clipped_words(with_rate(plain, 7.8))
 
 
+@pytest.mark.parametrize("sensor", ["accelerometer", "magnetometer"])
+def test_samples_that_a_slow_sensor_repeats_are_taken_once(sensor):
+    plain, name = swing(), SENSORS[sensor]
+    k = np.arange(len(plain.time))
+    faults = sensor_faults.find(dataclasses.replace(plain, **{name: getattr(plain, name)[k // 8 * 8]}))
+    turns = np.linalg.norm(plain.rate, axis=1) > 0.2
+    np.testing.assert_array_equal(np.isnan(getattr(faults.recording, name)[:, 0]), turns & (k % 8 > 0))
+    assert f"The {sensor} is slower than the gyro" in faults.words[0]
+
+
 def with_damaged(name: str, rows: slice, size: float) -> tuple[Recording, Recording]:
     """A recording, and the same with samples of a size in any direction; each of these is different."""
     plain = swing(10.0)

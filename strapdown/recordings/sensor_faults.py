@@ -11,6 +11,8 @@ A damaged sample is left out: a specific force beyond 16 g or a field far above 
 of the gyro is replaced, if only one in a row is damaged (:func:`damaged_rates`). At rest and in the hand such a specific force turned the
 attitude by up to 13°, a rate of 50 rad/s by up to 60°.
 
+A slow sensor's samples can be repeated up to the rate of the gyro's: each is taken once, for the repeated ones are late.
+
 Where a recording was resampled, a gap of its sensors can be filled by a straight line or by the last sample, which is no measurement: the
 rotation over it is as uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
 """
@@ -44,6 +46,8 @@ MIN_CLIPPED = 3
 """Minimum number of samples at the extreme, at least two of them consecutive, of a clipped axis."""
 MAX_REPEATS = 0.1
 """Maximum share of the other samples equal to the one before; above it the sensor repeats samples, and clipping is not reported."""
+HELD = 0.6, 0.99
+"""Limits of the share of a slow vector sensor's samples, while the unit turns, that repeat the one before; a stuck one has more."""
 RESTORED_ERROR = 0.5
 """σ of the rotation beyond the limit over a clipped run, relative to that of the cubic."""
 RESTORED_SPAN = 0.3
@@ -111,6 +115,12 @@ def find(recording: Recording) -> Faults:
         lost = np.asarray(saturated.any(axis=1))
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
+    for sensor, repeated in repeated_samples(recording).items():
+        name = SENSORS[sensor]
+        changes[name] = np.where(repeated[:, None], np.nan, changes.get(name, getattr(recording, name)))
+        words.append(
+            f"The {sensor} is slower than the gyro: {repeated.mean():.0%} of its samples repeat the one before and are ignored"
+        )
     steps = np.diff(recording.time)
     usual = recording.interval
     # The trapezoidal rule errs by T³/12 times the second derivative of the rate over an interval T.
@@ -195,6 +205,17 @@ def damaged_samples(recording: Recording) -> dict[str, np.ndarray]:
     compiled(kernel.find_damaged)(*arrays, share, LARGEST_FORCE, np.zeros(1), burst, damaged)
     by_sensor = zip(("accelerometer", "magnetometer"), damaged, strict=True)
     return {sensor: mask for sensor, mask in by_sensor if 0.0 < np.mean(mask) < 0.5}
+
+
+def repeated_samples(recording: Recording) -> dict[str, np.ndarray]:
+    """Return masks (n,) of the samples by which a slow accelerometer or magnetometer repeats the one before while the unit turns."""
+    turns, masks = lengths(recording.rate[1:]) > ROTATES, {}
+    for sensor in ("accelerometer", "magnetometer"):
+        if (samples := getattr(recording, SENSORS[sensor])) is not None and turns.any():
+            same = turns & np.all(samples[1:] == samples[:-1], axis=1)
+            if HELD[0] < np.count_nonzero(same) / np.count_nonzero(turns) < HELD[1]:
+                masks[sensor] = np.append(False, same)
+    return masks
 
 
 def second_differences(rate: Array) -> Array:
