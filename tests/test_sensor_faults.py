@@ -362,12 +362,13 @@ def test_a_sensor_that_is_often_clipped_is_warned_of():
 
 
 @pytest.mark.parametrize("sensor", ["accelerometer", "magnetometer"])
-def test_samples_that_a_slow_sensor_repeats_are_taken_once(sensor):
+def test_samples_that_a_slow_sensor_repeats_are_reported(sensor):
     plain, name = swing(), SENSORS[sensor]
     k = np.arange(len(plain.time))
     faults = sensor_faults.find(dataclasses.replace(plain, **{name: getattr(plain, name)[k // 8 * 8]}))
     turns = np.linalg.norm(plain.rate, axis=1) > 0.2
-    np.testing.assert_array_equal(np.isnan(getattr(faults.recording, name)[:, 0]), turns & (k % 8 > 0))
+    ignored = turns & (k % 8 > 0) & (sensor == "accelerometer")
+    np.testing.assert_array_equal(np.isnan(getattr(faults.recording, name)[:, 0]), ignored)
     assert f"The {sensor} is slower than the gyro" in faults.words[0]
 
 

@@ -11,7 +11,7 @@ A damaged sample is left out: a specific force beyond 16 g or a field far above 
 of the gyro is replaced, if only one in a row is damaged (:func:`damaged_rates`). At rest and in the hand such a specific force turned the
 attitude by up to 13°, a rate of 50 rad/s by up to 60°.
 
-A slow sensor's samples can be repeated up to the rate of the gyro's: each is taken once, for the repeated ones are late.
+A slow sensor's samples can be repeated up to the rate of the gyro's: the repeated ones are late, and those of an accelerometer left out.
 
 Where a recording was resampled, a gap of its sensors can be filled by a straight line or by the last sample, which is no measurement: the
 rotation over it is as uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
@@ -116,10 +116,14 @@ def find(recording: Recording) -> Faults:
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     for sensor, repeated in repeated_samples(recording).items():
-        name = SENSORS[sensor]
-        changes[name] = np.where(repeated[:, None], np.nan, changes.get(name, getattr(recording, name)))
+        remedy = "the field is up to that late; record it without"
+        if sensor == "accelerometer":  # a disturbed field of x-io's sample file has a worse heading so
+            changes["specific_force"] = np.where(
+                repeated[:, None], np.nan, changes.get("specific_force", recording.specific_force)
+            )
+            remedy = "those are ignored"
         words.append(
-            f"The {sensor} is slower than the gyro: {repeated.mean():.0%} of its samples repeat the one before and are ignored"
+            f"The {sensor} is slower than the gyro: {repeated.mean():.0%} of its samples repeat the one before; {remedy}"
         )
     steps = np.diff(recording.time)
     usual = recording.interval
