@@ -116,11 +116,9 @@ def find(recording: Recording) -> Faults:
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     for sensor, repeated in repeated_samples(recording).items():
-        remedy = "the field is up to that late; record it without"
-        if sensor == "accelerometer":  # a disturbed field of x-io's sample file has a worse heading so
-            changes["specific_force"] = np.where(
-                repeated[:, None], np.nan, changes.get("specific_force", recording.specific_force)
-            )
+        remedy = "those are late; record it without them"
+        if sensor == "accelerometer" and force is not None:  # without them, the heading of a disturbed field was worse
+            changes["specific_force"] = np.where(repeated[:, None], np.nan, changes.get("specific_force", force))
             remedy = "those are ignored"
         words.append(
             f"The {sensor} is slower than the gyro: {repeated.mean():.0%} of its samples repeat the one before; {remedy}"
