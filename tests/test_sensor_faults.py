@@ -370,6 +370,10 @@ def test_samples_that_a_slow_sensor_repeats_are_reported(sensor):
     ignored = turns & (k % 8 > 0) & (sensor == "accelerometer")
     np.testing.assert_array_equal(np.isnan(getattr(faults.recording, name)[:, 0]), ignored)
     assert f"The {sensor} is slower than the gyro" in faults.words[0]
+    level = np.where(
+        k[:, None] < 0.7 * len(k), [0.0, 0.0, 9.81], getattr(plain, name)
+    )  # without noise, about the vertical
+    assert sensor_faults.repeated_samples(dataclasses.replace(plain, **{name: level})) == {}
 
 
 def with_damaged(name: str, rows: slice, size: float) -> tuple[Recording, Recording]:

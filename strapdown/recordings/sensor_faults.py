@@ -48,6 +48,8 @@ MAX_REPEATS = 0.1
 """Maximum share of the other samples equal to the one before; above it the sensor repeats samples, and clipping is not reported."""
 HELD = 0.6, 0.99
 """Limits of the share of a slow vector sensor's samples, while the unit turns, that repeat the one before; a stuck one has more."""
+MAX_HELD = 4.0
+"""Maximum number of such repetitions in a row, relative to their mean."""
 RESTORED_ERROR = 0.5
 """σ of the rotation beyond the limit over a clipped run, relative to that of the cubic."""
 RESTORED_SPAN = 0.3
@@ -218,7 +220,9 @@ def repeated_samples(recording: Recording) -> dict[str, np.ndarray]:
         same = np.zeros(0, bool) if samples is None else turns & (samples[1:, 0] == samples[:-1, 0])
         if np.count_nonzero(same) > HELD[0] * usual:  # hardly ever: saves the comparison of the other axes
             same &= np.all(samples[1:, 1:] == samples[:-1, 1:], axis=1)
-            if HELD[0] < np.count_nonzero(same) / usual < HELD[1]:
+            share = np.count_nonzero(same) / usual
+            new = np.flatnonzero(~same[turns])  # of a sensor without noise, there are none for long
+            if HELD[0] < share < HELD[1] and np.diff(new, prepend=-1, append=usual).max() < MAX_HELD / (1.0 - share):
                 masks[sensor] = np.append(False, same)
     return masks
 
