@@ -356,8 +356,9 @@ def take_rate_at_rest(x: Array, P: Array, rate: Array, sigma: float, gained: flo
         change += (root * (component - change[k])) * gain
         P -= gain[:, None] * gain
     attitude, reset = moved(x[:4].tolist(), change[:3].tolist())
-    P[:3] = np.reshape(reset, (3, 3)) @ P[:3]
-    P[:3, :3] = P[:3, :3] @ np.reshape(reset, (3, 3)).T
+    J = np.reshape(reset, (3, 3))
+    P[:3] = J @ P[:3]
+    P[:3, :3] = P[:3, :3] @ J.T
     P[:, :3] = P[:3].T
     x[:4] = unit(attitude)
     x[4:] += change[3:]

@@ -560,9 +560,7 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         length=divisors(problem.record, problem.events, model, units),
         turning=turns(problem),
         offsets=model.offsets,
-        warming=np.diff(driving_temperature(problem)) / problem.record.intervals
-        if model.structure.slopes
-        else np.empty(0),
+        warming=warming(problem),
         warming_now=np.zeros(1),
         root=np.zeros(sizes.N**2),
     )
@@ -578,6 +576,13 @@ def driving_temperature(problem: Problem) -> Array:
         )
     span = next(block.span for block in problem.error_states if isinstance(block, GyroTemperature))
     return np.clip(problem.record.temperature, *span)
+
+
+def warming(problem: Problem) -> Array:
+    """Return the rate of that temperature in each interval (n,), K/s; empty without slopes of the gyro's bias."""
+    if not problem.model.structure.slopes:
+        return np.empty(0)
+    return np.asarray(np.diff(driving_temperature(problem)) / problem.record.intervals)
 
 
 def aligned_zeros(*shape: int) -> Array:

@@ -369,11 +369,9 @@ class _ManyStates:
             np.zeros(n + kernels.NOISY_WIDTH),
             np.zeros(chains.SET * max(len(model.last), 1)),
         )
-        warming = np.empty(0)
+        warming = forward.warming(self.problem)
         if without.slopes:
-            share = segments[:-1, 0] / np.repeat(self.problem.record.intervals, np.diff(starts))
-            change = np.diff(forward.driving_temperature(self.problem))
-            warming = 0.5 * share * np.repeat(change, np.diff(starts))
+            warming = 0.5 * segments[:-1, 0] * np.repeat(warming, np.diff(starts))
         space = smoother.Workspace._make((*states, *matrices, *others, noisy, warming))
         steps_back = model._replace(  # noise of negative variance
             angle_variance=-model.angle_variance, rate_variance=-model.rate_variance, chains=model.chains * [1.0, -1.0]
